@@ -1,0 +1,1 @@
+"""Pre-Grasp informed Dexterous Manipulation."""
