@@ -1,0 +1,28 @@
+"""Ends of an episode (SPEC 1, Reward and end): one flag a simulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from pgdm.mdp.context import StepContext
+from pgdm.mdp.rewards import object_error
+
+
+@dataclass(frozen=True)
+class TerminationCfg:
+    """When an episode ends early."""
+
+    max_object_error_m: float
+    """Distance of the object from its target at which the episode ends, m."""
+
+
+def object_lost(c: StepContext, max_error_m: float) -> Tensor:
+    """Return whether the object is ``max_error_m`` or more away from its target, (n,) bool."""
+    return object_error(c) >= max_error_m
+
+
+def motion_ended(c: StepContext) -> Tensor:
+    """Return whether the motion is over, (n,) bool: a true terminal in R, nothing follows it."""
+    return c.t >= c.last_t

@@ -1,0 +1,50 @@
+"""The exemplar object trajectory: immutable; an index goes in, a target comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pgdm.library import Motion
+
+# Steps ahead whose targets the agent sees (R, reference motion goals).
+GOAL_STEPS = (1, 5, 10)
+# Frequencies of the positional encoding of time (R).
+TIME_FREQUENCIES = (1, 4, 6, 8)
+
+
+@dataclass(frozen=True)
+class ObjectReference:
+    """Trajectory X = [x_0..x_{T-1}] of the followed object, world frame, float64 (SPEC 1)."""
+
+    pos: Tensor
+    """(T, 3) m, compared with the object body's centre of mass."""
+    quat: Tensor
+    """(T, 4) unit, wxyz, compared with the object body's orientation."""
+
+    @classmethod
+    def of(cls, motion: Motion) -> ObjectReference:
+        """Take the trajectory of a stored motion."""
+        return cls(torch.as_tensor(motion.translation), torch.as_tensor(motion.orientation))
+
+    def __len__(self) -> int:
+        """Return T, the number of poses; an episode has at most T-1 steps."""
+        return self.pos.shape[0]
+
+    def goals(self) -> Tensor:
+        """Return what the agent sees of the targets ahead at every step, (T, 21).
+
+        For each of ``GOAL_STEPS``: orientation (4), then translation (3), at the end of the
+        motion those of its last pose (R).
+        """
+        now = torch.arange(len(self))
+        ahead = [(now + k).clamp(max=len(self) - 1) for k in GOAL_STEPS]
+        return torch.cat([torch.cat((self.quat[j], self.pos[j]), -1) for j in ahead], -1)
+
+    def time_encoding(self) -> Tensor:
+        """Return sin(c t/T) for c in ``TIME_FREQUENCIES``, then the cosines, (T, 8) (R)."""
+        now = torch.arange(len(self), dtype=torch.float64) / len(self)
+        phase = now[:, None] * torch.tensor(TIME_FREQUENCIES, dtype=torch.float64)
+        return torch.cat((phase.sin(), phase.cos()), -1)

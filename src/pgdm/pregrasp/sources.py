@@ -1,0 +1,66 @@
+"""Where an episode starts: the pre-grasp as stored, in its several forms, or the reset pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pgdm.errors import ConfigError
+from pgdm.library import Motion
+from pgdm.sim.scene import Scene
+
+SOURCES = ("planned", "mined", "learned", "none")
+
+
+@dataclass(frozen=True)
+class PregraspCfg:
+    """Which start state to use (SPEC 1 and 2)."""
+
+    source: str
+    """``planned``: state after the reach planner moved the hand to its pre-grasp; ``mined``: the
+    pre-grasp as found, kinematic; ``learned``: as a mesh-conditioned model predicted it; ``none``:
+    the hand's reset pose, all joints zero."""
+
+
+@dataclass(frozen=True)
+class StartState:
+    """State in which every episode of a task begins."""
+
+    qpos: np.ndarray  # (nq,) m, rad
+    qvel: np.ndarray  # (nv,) m/s, rad/s
+
+
+def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
+    """Return the start state of a task.
+
+    With ``none`` the object stands where the mined pre-grasp has it (SPEC 3).
+
+    Raises:
+        ConfigError: if the source is unknown, is not stored for this task, or does not fit the
+            scene's joints.
+    """
+    if cfg.source not in SOURCES:
+        raise ConfigError(f"pregrasp.source '{cfg.source}' is unknown; valid: {', '.join(SOURCES)}")
+    wanted = "mined" if cfg.source == "none" else cfg.source
+    if wanted not in motion.starts:
+        hint = (
+            "; stored plans come with a TCDM checkout: pgdm assets import PATH"
+            if wanted == "planned"
+            else ""
+        )
+        raise ConfigError(
+            f"task '{scene.task.id}' has no stored start '{wanted}' in source '{motion.source}'; "
+            f"it has: {', '.join(sorted(motion.starts))} (pregrasp=...){hint}"
+        )
+    start = motion.starts[wanted]
+    qpos, qvel = np.array(start.qpos), np.array(start.qvel)
+    if qpos.shape != (scene.model.nq,) or qvel.shape != (scene.model.nv,):
+        raise ConfigError(
+            f"start '{wanted}' of motion '{motion.id}' has {qpos.size} positions and {qvel.size} "
+            f"velocities, the scene of '{scene.task.id}' has {scene.model.nq} and {scene.model.nv}"
+        )
+    if cfg.source == "none":
+        qpos[: scene.model.nu] = 0.0
+        qvel[:] = 0.0
+    return StartState(qpos, qvel)

@@ -1,0 +1,192 @@
+"""Table + hand + objects -> one compiled model and a table of what is where in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from pgdm.errors import SceneError
+from pgdm.library import Library
+
+# SPEC 5, R: the randomised contact geom outranks what it touches, so that its friction counts.
+RANDOMIZED_PRIORITY = 10
+
+
+@dataclass(frozen=True)
+class PlacementCfg:
+    """Where a body of an object stands, if not where the object's own file puts it."""
+
+    body: str
+    """Scene name of the body, such as ``door/frame``."""
+    pos_m: list[float] | None
+    """Position in the world frame, (3,) m, or None to leave it."""
+    quat: list[float] | None
+    """Orientation in the world frame, (4,) wxyz, or None to leave it."""
+
+
+@dataclass(frozen=True)
+class TaskCfg:
+    """One task: what is followed along which motion (SPEC 1)."""
+
+    id: str
+    """Task id, ``<object>-<motion>`` or ``<hand>-<object>``."""
+    objects: list[str]
+    """Library names of the objects in the scene, in the order of their joints."""
+    tracked_body: str
+    """Scene name of the followed body; its centre of mass and orientation count."""
+    motion: str
+    """Library id of the exemplar motion with its stored start states."""
+    timestep_s: float
+    """Physics timestep, s."""
+    placements: list[PlacementCfg]
+    """Bodies placed elsewhere than in their own file."""
+    randomize: bool
+    """Whether friction and size of the first object's contact geom vary per reset (SPEC 5)."""
+    tcdm30: bool
+    """Whether the task belongs to the abridged suite."""
+    pregrasp_source: str
+    """Where the paper's pre-grasp came from: mocap, teleop, labeled or learned."""
+    trajectory_source: str
+    """Where the exemplar motion came from: mocap, expert or animator."""
+    paper_success: float | None
+    """Success of the paper's PGDM after 50M frames, mean of 3 seeds (0..1)."""
+    paper_com_error: float | None
+    """The paper's error column, compared with ``com_error_released``, m."""
+
+
+@dataclass(frozen=True)
+class HandCfg:
+    """What the MDP needs to know of a hand beyond its model."""
+
+    name: str
+    """Library name and scene prefix of the hand."""
+    points: list[str]
+    """Geoms (each in a body of the same name) whose poses are observed, in observation order."""
+    fingertips: list[int]
+    """Which of the points are fingertips."""
+    gravity_compensation: str
+    """``all`` actuated joints are held against gravity, or only the ``base`` joints."""
+    num_base_joints: int
+    """Number of joints, first in qpos, that place the wrist."""
+    mount_body: str
+    """Body that carries the base joints, child of the world."""
+
+
+@dataclass(frozen=True)
+class SimCfg:
+    """Solver settings (SPEC 1, Scene)."""
+
+    solver_iterations: int
+    """Newton iterations at most per physics step."""
+    noslip_iterations: int
+    """Iterations of the noslip solver per physics step."""
+
+
+@dataclass(frozen=True)
+class SceneIndex:
+    """Ids and constants of a scene, looked up by name once."""
+
+    point_geoms: np.ndarray  # (P,) geom ids
+    point_bodies: np.ndarray  # (P,) body ids
+    object_body: int
+    fingertips: np.ndarray  # (F,) rows of the points
+    num_actuators: int
+    num_compensated: int  # joints held against gravity, first in qvel
+    num_base_joints: int
+    ctrl_low: np.ndarray  # (nu,)
+    ctrl_high: np.ndarray  # (nu,)
+    mount_pos: np.ndarray  # (3,) m, world frame, base joints at zero
+    mount_quat: np.ndarray  # (4,) wxyz
+    randomized_geom: int | None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled scene."""
+
+    model: mujoco.MjModel
+    index: SceneIndex
+    task: TaskCfg
+    hand: HandCfg
+    asset_source: str
+    """The library's source that serves the task's assets."""
+
+
+def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> Scene:
+    """Compile the scene of a task.
+
+    Raises:
+        SceneError: if it does not compile or a body, geom or joint is missing.
+        LibraryError: if the library lacks an asset.
+    """
+    source = library.source_of(task.motion)
+    spec = mujoco.MjSpec.from_file(str(library.scene_xml(source)))
+    spec.option.timestep = task.timestep_s
+    spec.option.iterations = sim.solver_iterations
+    spec.option.noslip_iterations = sim.noslip_iterations
+    files = [library.hand_xml(hand.name, source)]
+    files += [library.object_xml(name, source) for name in task.objects]
+    for file in files:
+        child = mujoco.MjSpec.from_file(str(file))
+        frame = spec.worldbody.add_frame()
+        spec.attach(child, frame=frame, prefix=f"{child.modelname}/")
+    for placement in task.placements:
+        _place(spec, placement)
+    randomized = _randomized_geom(spec, task) if task.randomize else None
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise SceneError(f"the scene of task '{task.id}' does not compile: {error}") from error
+    return Scene(model, _index(model, task, hand, randomized), task, hand, source)
+
+
+def _place(spec: mujoco.MjSpec, placement: PlacementCfg) -> None:
+    body = spec.body(placement.body)
+    if body is None:
+        names = ", ".join(sorted(b.name for b in spec.bodies if b.name))
+        raise SceneError(f"no body '{placement.body}' to place; the scene has: {names}")
+    if placement.pos_m is not None:
+        body.pos = placement.pos_m
+    if placement.quat is not None:
+        body.quat = placement.quat
+
+
+def _randomized_geom(spec: mujoco.MjSpec, task: TaskCfg) -> str:
+    """Return the name of the first object's contact geom, and raise its contact priority."""
+    body = spec.body(task.tracked_body)
+    geoms = [] if body is None else [g for g in body.geoms if g.contype or g.conaffinity]
+    if len(geoms) != 1:
+        raise SceneError(f"task '{task.id}': randomize needs one contact geom, found {len(geoms)}")
+    geoms[0].priority = RANDOMIZED_PRIORITY
+    return geoms[0].name
+
+
+def _index(
+    model: mujoco.MjModel, task: TaskCfg, hand: HandCfg, randomized: str | None
+) -> SceneIndex:
+    def find(kind: mujoco.mjtObj, name: str) -> int:
+        found = mujoco.mj_name2id(model, kind, name)
+        if found < 0:
+            raise SceneError(f"task '{task.id}': the scene has no {kind.name[6:].lower()} '{name}'")
+        return found
+
+    points = [f"{hand.name}/{point}" for point in hand.points]
+    mount = find(mujoco.mjtObj.mjOBJ_BODY, f"{hand.name}/{hand.mount_body}")
+    compensated = model.nu if hand.gravity_compensation == "all" else hand.num_base_joints
+    geom = mujoco.mjtObj.mjOBJ_GEOM
+    return SceneIndex(
+        point_geoms=np.array([find(geom, p) for p in points]),
+        point_bodies=np.array([find(mujoco.mjtObj.mjOBJ_BODY, p) for p in points]),
+        object_body=find(mujoco.mjtObj.mjOBJ_BODY, task.tracked_body),
+        fingertips=np.array(hand.fingertips),
+        num_actuators=model.nu,
+        num_compensated=compensated,
+        num_base_joints=hand.num_base_joints,
+        ctrl_low=model.actuator_ctrlrange[:, 0].copy(),
+        ctrl_high=model.actuator_ctrlrange[:, 1].copy(),
+        mount_pos=model.body_pos[mount].copy(),
+        mount_quat=model.body_quat[mount].copy(),
+        randomized_geom=None if randomized is None else find(geom, randomized),
+    )
