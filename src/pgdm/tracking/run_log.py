@@ -1,0 +1,155 @@
+"""The append-only record of a run, ``metrics.jsonl``: the truth that trackers mirror."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from pgdm.errors import RunError
+
+FILE_NAME = "metrics.jsonl"
+HEADER = ("frames", "iteration", "time_s", "kind")
+"""Keys of a line that are not metrics."""
+
+_log = logging.getLogger(__name__)
+
+Record = dict[str, float | int | str]
+
+
+class RunLog:
+    """One JSON object a line, each written whole or not at all.
+
+    A process that dies while writing leaves at most one unfinished last line: readers pass over
+    it and the next ``append`` removes it. Values that are not finite are stored as ``null`` and
+    read back as NaN, so that every line is JSON that other programs can read.
+
+    Args:
+        path: the file; its folder must exist.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def append(
+        self, metrics: Mapping[str, float], *, frames: int, iteration: int, time_s: float, kind: str
+    ) -> None:
+        """Add one line.
+
+        Args:
+            metrics: name to value.
+            frames: environment steps so far, all simulations together.
+            iteration: learner iterations so far.
+            time_s: wall time of the run so far, s, all attempts together.
+            kind: ``train`` or ``eval``.
+
+        Raises:
+            RunError: if the file cannot be written (folder gone, disk full, read-only).
+        """
+        values = {name: _finite(value) for name, value in metrics.items()}
+        record = {"frames": frames, "iteration": iteration, "time_s": round(time_s, 3)}
+        line = json.dumps({**record, "kind": kind, **values}, allow_nan=False) + "\n"
+        try:
+            with open(self.path, "ab") as file:
+                _drop_unfinished_line(self.path, file.tell())
+                file.write(line.encode())
+        except OSError as error:
+            raise RunError(
+                f"cannot write {self.path}: {error.strerror or error}; make room or give write "
+                "access, then start the same command again: it continues from the last checkpoint"
+            ) from error
+
+    def read(self) -> list[Record]:
+        """Return all whole lines in order; of lines with equal kind and frames, the last one.
+
+        Raises:
+            RunError: if the file exists but cannot be read.
+        """
+        try:
+            raw = self.path.read_bytes()
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
+        kept: dict[tuple[str, int], Record] = {}
+        lines = raw.split(b"\n")
+        for number, line in enumerate(lines[:-1], start=1):  # the last has no newline: unfinished
+            record = _parse(line)
+            if record is None:
+                _log.warning("%s: line %d is damaged and left out", self.path, number)
+                continue
+            key = (str(record["kind"]), int(record["frames"]))
+            kept.pop(key, None)  # so that the replacement stands at its own place
+            kept[key] = record
+        return list(kept.values())
+
+    def truncate(self, frames: int) -> int:
+        """Drop all lines after ``frames``, which a resumed run will write again.
+
+        The file is replaced in one step: it is never seen half written.
+
+        Returns:
+            How many lines were dropped, an unfinished one included.
+
+        Raises:
+            RunError: if the file cannot be written.
+        """
+        if not self.path.exists():
+            return 0
+        lines = [line for line in self.path.read_bytes().split(b"\n") if line]
+        whole = [line for line in lines if (r := _parse(line)) and int(r["frames"]) <= frames]
+        if len(whole) == len(lines):
+            return 0
+        temp = self.path.with_name(self.path.name + ".tmp")
+        try:
+            with open(temp, "wb") as file:
+                file.writelines(line + b"\n" for line in whole)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temp, self.path)
+        except OSError as error:
+            temp.unlink(missing_ok=True)
+            raise RunError(f"cannot write {self.path}: {error.strerror or error}") from error
+        return len(lines) - len(whole)
+
+
+def metrics_of(record: Record) -> dict[str, float]:
+    """Return the finite metrics of a record, without frames, iteration, time and kind."""
+    values = {name: float(v) for name, v in record.items() if name not in HEADER}
+    return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+def _finite(value: float) -> float | None:
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def _drop_unfinished_line(path: Path, size: int) -> None:
+    """Cut off what follows the last newline, if anything."""
+    if size == 0:
+        return
+    with open(path, "rb+") as file:
+        file.seek(size - 1)
+        if file.read(1) == b"\n":
+            return
+        file.seek(0)
+        end = file.read().rfind(b"\n") + 1
+        file.truncate(end)
+
+
+def _parse(line: bytes) -> Record | None:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    if not isinstance(record, dict) or not isinstance(record.get("frames"), int):
+        return None
+    if "kind" not in record or not all(
+        value is None or isinstance(value, int | float) or name == "kind"
+        for name, value in record.items()
+    ):
+        return None
+    return {name: math.nan if value is None else value for name, value in record.items()}

@@ -1,0 +1,55 @@
+"""What a run tells the outside world, and the tracker that tells nobody."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class TrackingCfg:
+    """Where a run is mirrored to; its own folder is complete without it."""
+
+    kind: str
+    """``mlflow`` or ``none``."""
+    uri: str | None
+    """Tracking server or database, such as ``http://host:5000`` or ``sqlite:////data/mlflow.db``;
+    None: a SQLite file ``mlflow.db`` in the folder of runs."""
+    experiment: str
+    """Name under which runs are grouped."""
+
+
+class Tracker(ABC):
+    """A mirror of a run. Only ``log`` is mandatory.
+
+    No method may block for long or raise because the mirror is out of reach: the run's folder
+    is the truth, and a mirror can be rebuilt from it.
+    """
+
+    @abstractmethod
+    def log(self, metrics: Mapping[str, float], frames: int) -> None:
+        """Record metrics at a number of frames (environment steps, all simulations together)."""
+
+    def params(self, config: Mapping[str, object]) -> None:  # noqa: B027 - optional by design
+        """Record the configuration of the run, a nested mapping of plain values."""
+
+    def artifact(self, path: Path, folder: str = "") -> None:  # noqa: B027
+        """Keep a copy of a file, in a folder of the run's artifacts."""
+
+    def video(self, path: Path, poster: Path | None, frames: int) -> None:  # noqa: B027
+        """Keep an MP4 of the policy after ``frames`` and its poster picture."""
+
+    def finish(self, status: str) -> None:  # noqa: B027
+        """Close the record with status ``finished``, ``failed`` or ``killed``.
+
+        Called once, at the end of the process; waits a bounded time for what is under way.
+        """
+
+
+class NullTracker(Tracker):
+    """Keeps nothing."""
+
+    def log(self, metrics: Mapping[str, float], frames: int) -> None:
+        """Do nothing."""
