@@ -21,12 +21,16 @@ class PregraspCfg:
     """``planned``: state after the reach planner moved the hand to its pre-grasp; ``mined``: the
     pre-grasp as found, kinematic; ``learned``: as a mesh-conditioned model predicted it; ``none``:
     the hand's reset pose, all joints zero."""
+    fallback: str | None
+    """Source to take where this one is not stored for a task, or None: then it is an error. The
+    asset library that the program fetches has no plans, only mined pre-grasps."""
 
 
 @dataclass(frozen=True)
 class StartState:
     """State in which every episode of a task begins."""
 
+    source: str  # where it came from, which may be the fallback
     qpos: np.ndarray  # (nq,) m, rad
     qvel: np.ndarray  # (nv,) m/s, rad/s
 
@@ -42,16 +46,14 @@ def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
     """
     if cfg.source not in SOURCES:
         raise ConfigError(f"pregrasp.source '{cfg.source}' is unknown; valid: {', '.join(SOURCES)}")
-    wanted = "mined" if cfg.source == "none" else cfg.source
+    stored = cfg.source in motion.starts or cfg.source == "none"
+    source = cfg.source if stored or cfg.fallback is None else cfg.fallback
+    wanted = "mined" if source == "none" else source
     if wanted not in motion.starts:
-        hint = (
-            "; stored plans come with a TCDM checkout: pgdm assets import PATH"
-            if wanted == "planned"
-            else ""
-        )
         raise ConfigError(
             f"task '{scene.task.id}' has no stored start '{wanted}' in source '{motion.source}'; "
-            f"it has: {', '.join(sorted(motion.starts))} (pregrasp=...){hint}"
+            f"it has: {', '.join(sorted(motion.starts))} (pregrasp=...). Stored plans come with a "
+            f"TCDM checkout: pgdm assets import PATH"
         )
     start = motion.starts[wanted]
     qpos, qvel = np.array(start.qpos), np.array(start.qvel)
@@ -60,7 +62,7 @@ def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
             f"start '{wanted}' of motion '{motion.id}' has {qpos.size} positions and {qvel.size} "
             f"velocities, the scene of '{scene.task.id}' has {scene.model.nq} and {scene.model.nv}"
         )
-    if cfg.source == "none":
+    if source == "none":
         qpos[: scene.model.nu] = 0.0
         qvel[:] = 0.0
-    return StartState(qpos, qvel)
+    return StartState(source, qpos, qvel)

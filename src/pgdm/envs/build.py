@@ -1,0 +1,67 @@
+"""From configuration and library to a batch env."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from pgdm.envs.batch_env import BatchEnv, Mdp
+from pgdm.library import Library
+from pgdm.mdp.actions import ActionCfg, action_map
+from pgdm.mdp.observations import ObsCfg, layout
+from pgdm.mdp.recipe import Recipe
+from pgdm.motion.reference import ObjectReference
+from pgdm.pregrasp.sources import PregraspCfg, start_state
+from pgdm.sim.batch import SimBatch
+from pgdm.sim.randomize import Randomizer
+from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
+
+
+@dataclass(frozen=True)
+class EnvCfg:
+    """What an environment is made of."""
+
+    task: TaskCfg
+    hand: HandCfg
+    sim: SimCfg
+    pregrasp: PregraspCfg
+    obs: ObsCfg
+    action: ActionCfg
+
+
+class EnvBuilder:
+    """Compiles a task once and makes batches of it.
+
+    Raises:
+        PgdmError: if the library lacks an asset, the scene does not compile, or the start state
+            is not stored.
+    """
+
+    def __init__(self, library: Library, cfg: EnvCfg, recipe: Recipe) -> None:
+        self.scene: Scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
+        self.motion = library.motion(cfg.task.motion)
+        start = start_state(cfg.pregrasp, self.motion, self.scene)
+        reference = ObjectReference.of(self.motion)
+        index = self.scene.index
+        self.mdp = Mdp(
+            reference=reference,
+            start=start,
+            observe=layout(cfg.obs, index, reference),
+            actions=action_map(cfg.action, index, reference, torch.from_numpy(start.qpos)),
+            recipe=recipe,
+        )
+
+    def make(
+        self,
+        num_envs: int,
+        num_threads: int = 0,
+        seed: int = 0,
+        auto_reset: bool = True,
+        dump_dir: Path | None = None,
+    ) -> BatchEnv:
+        """Return N simulations of the task; see `BatchEnv` for the arguments."""
+        sim = SimBatch(self.scene, num_envs, num_threads, self.motion.substeps)
+        randomize = Randomizer(seed, num_envs) if self.scene.task.randomize else None
+        return BatchEnv(sim, self.mdp, randomize, auto_reset, dump_dir)

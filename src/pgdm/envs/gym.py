@@ -1,0 +1,90 @@
+"""The Gymnasium face: one simulation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from pgdm.envs.batch_env import BatchEnv
+from pgdm.sim.render import Renderer
+
+CONTROL_HZ = 25
+
+
+class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One task as a Gymnasium environment.
+
+    Observations are float32 (D,) in the chosen layout, actions float32 (A,) in [-1, 1].
+    ``terminated``: the object was lost or the motion ended; ``truncated``: the simulation
+    diverged. ``info`` holds ``object_error_m`` (m), ``success`` (the step is within the
+    threshold) and, at an episode's end, ``episode_metrics``.
+
+    Args:
+        batch: the task with one simulation and ``auto_reset=False``.
+        render_mode: ``rgb_array`` or None.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012 (Gymnasium's own form)
+
+    def __init__(self, batch: BatchEnv, render_mode: str | None = None) -> None:
+        self._batch = batch
+        self.render_mode = render_mode
+        self.observation_space = spaces.Box(-np.inf, np.inf, (batch.obs_dim,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (batch.action_dim,), np.float32)
+        self._data = mujoco.MjData(self.model)
+        self._renderer: Renderer | None = None
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """MuJoCo's model of the scene."""
+        return self._batch.sim.scene.model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """MuJoCo's data in the current state: a copy, writing to it changes nothing."""
+        return self._batch.sim.batch.get_data(0, self._data)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Restart the episode; ``seed`` matters only to tasks that vary per reset."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self._batch.reseed(seed)
+        obs = self._batch.reset()
+        return obs[0].numpy().copy(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Take one control step (0.04 s)."""
+        tensor = torch.as_tensor(np.asarray(action, np.float32))[None]
+        obs, reward, terminated, truncated, info = self._batch.step(tensor)
+        out: dict[str, Any] = {
+            "object_error_m": float(info["object_error_m"][0]),
+            "success": bool(info["success"][0]),
+        }
+        if info["episodes"]:
+            out["episode_metrics"] = {k: float(v[0]) for k, v in info["episodes"].items()}
+        row = obs[0].numpy().copy()
+        return row, float(reward[0]), bool(terminated[0]), bool(truncated[0]), out
+
+    def render(self) -> np.ndarray | None:
+        """Return the current picture, (H, W, 3) uint8, the goal drawn as a ghost."""
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            scene = self._batch.sim.scene
+            self._renderer = Renderer(scene.model, scene.index.object_body)
+        t = int(self._batch.t[0])
+        reference = self._batch.mdp.reference
+        return self._renderer.render(self.data, (reference.pos[t].numpy(), reference.quat[t].numpy()))
+
+    def close(self) -> None:
+        """Free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
