@@ -1,0 +1,1 @@
+"""Settings: their types, their values from ``conf/``, and what identifies an experiment."""

@@ -1,0 +1,62 @@
+"""Which settings there are to choose from, read from ``conf/`` without loading anything heavy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pgdm.errors import ConfigError, UnknownNameError
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def conf_dir() -> Path:
+    """Return the folder of the settings: inside an installed package, else the repository's.
+
+    Raises:
+        ConfigError: if the installation lacks it.
+    """
+    for folder in (_PACKAGE / "conf", _PACKAGE.parents[1] / "conf"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    raise ConfigError(
+        f"the settings (conf/config.yaml) are missing beside {_PACKAGE}; install pgdm anew"
+    )
+
+
+def _folders(config_dir: str | Path | None) -> list[Path]:
+    own = [conf_dir()]
+    return own if config_dir is None else [*own, Path(config_dir)]
+
+
+def groups(config_dir: str | Path | None = None) -> list[str]:
+    """Return the names of the config groups, such as ``task``."""
+    names = {
+        path.name
+        for folder in _folders(config_dir)
+        if folder.is_dir()
+        for path in folder.iterdir()
+        if path.is_dir() and path.name[0] not in "._" and path.name != "hydra"
+    }
+    return sorted(names)
+
+
+def available(group: str, config_dir: str | Path | None = None) -> list[str]:
+    """Return the options of a config group, such as the tasks for ``task``.
+
+    Args:
+        group: name of the group.
+        config_dir: a folder of the user's own settings to look into besides.
+
+    Raises:
+        UnknownNameError: if there is no such group.
+    """
+    known = groups(config_dir)
+    if group not in known:
+        raise UnknownNameError("config group", group, known)
+    names = {
+        path.stem
+        for folder in _folders(config_dir)
+        for path in (folder / group).glob("*.yaml")
+        if not path.name.startswith("_")
+    }
+    return sorted(names)

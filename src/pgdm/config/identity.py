@@ -1,0 +1,84 @@
+"""What makes two experiments the same one, and whether a run may go on under new settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from pgdm.config.schema import ExperimentCfg
+from pgdm.config.strict import flatten
+from pgdm.errors import RunError
+
+# Keys that change where, when and how a run is done or shown, not what it computes.
+_BESIDE = (
+    "run_dir",
+    "resume",
+    "offline",
+    "budget",
+    "num_threads",  # simulations do not depend on it
+    "device",  # a run may move between machines
+    "total_frames",  # a longer run begins with the shorter one
+    "tracking",
+    "checkpoint",
+    "eval.interval_frames",
+    "eval.video",
+    "eval.video_every_eval",
+    # What is known of the task, and does not act on it.
+    "task.pregrasp_source",
+    "task.trajectory_source",
+    "task.tcdm30",
+    "task.paper_success",
+    "task.paper_com_error",
+)
+
+
+def identity(cfg: ExperimentCfg) -> dict[str, Any]:
+    """Return the keys (dotted) and values that change the result of an experiment."""
+    flat = flatten(dataclasses.asdict(cfg))
+    return {k: v for k, v in flat.items() if not any(_inside(k, beside) for beside in _BESIDE)}
+
+
+def _inside(key: str, part: str) -> bool:
+    return key == part or key.startswith(f"{part}.")
+
+
+def identity_hash(cfg: ExperimentCfg) -> str:
+    """Return 8 hex digits that two experiments share if their identities are equal."""
+    text = json.dumps(identity(cfg), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def default_run_dir(cfg: ExperimentCfg) -> str:
+    """Return the run folder, relative to the working directory, that belongs to an experiment."""
+    start = f"{cfg.pregrasp.source}-{cfg.action.kind}-{cfg.algo.name}"
+    name = f"{start}-s{cfg.seed}-{identity_hash(cfg)}"
+    return str(Path("runs") / cfg.task.id / cfg.method.name / name)
+
+
+def difference(old: ExperimentCfg, new: ExperimentCfg) -> list[str]:
+    """Return what changed of the identity, one ``key: old -> new`` an entry."""
+    before, after = identity(old), identity(new)
+    return [
+        f"{key}: {before.get(key)} -> {after.get(key)}"
+        for key in sorted(before.keys() | after.keys())
+        if before.get(key) != after.get(key)
+    ]
+
+
+def check_continues(old: ExperimentCfg, new: ExperimentCfg) -> None:
+    """Check that ``new`` may go on in the run folder that ``old`` was saved in.
+
+    Raises:
+        RunError: if it is another experiment, or a shorter one; the message is the difference.
+    """
+    changes = difference(old, new)
+    if new.total_frames < old.total_frames:
+        changes.append(f"total_frames: {old.total_frames} -> {new.total_frames} (it may only grow)")
+    if changes:
+        raise RunError(
+            f"run folder '{new.run_dir}' holds another experiment ({'; '.join(changes)}); "
+            "choose another run_dir, or the settings it was made with"
+        )

@@ -1,0 +1,216 @@
+"""One experiment as a whole: its parts, and the rules that hold between them."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from pgdm.config.strict import flatten
+from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.mdp.actions import ActionCfg
+from pgdm.mdp.observations import ObsCfg
+from pgdm.methods import METHODS, MethodCfg
+from pgdm.pregrasp.sources import SOURCES, PregraspCfg
+from pgdm.rl.checkpoint import CheckpointCfg
+from pgdm.rl.evaluate import EvalCfg
+from pgdm.rl.trainer import PPOCfg
+from pgdm.sim.scene import HandCfg, SimCfg, TaskCfg
+from pgdm.tracking.tracker import TrackingCfg
+
+
+@dataclass(frozen=True)
+class AblationCfg:
+    """What is taken away from the method or its pre-grasp."""
+
+    name: str
+    """Name of the ablation; ``none`` takes nothing away."""
+
+
+@dataclass(frozen=True)
+class ExperimentCfg:
+    """Everything that one run needs to know; made only by ``pgdm.config.store``."""
+
+    task: TaskCfg
+    """What is moved along which motion."""
+    hand: HandCfg
+    """The hand that moves it."""
+    pregrasp: PregraspCfg
+    """Where an episode starts."""
+    method: MethodCfg
+    """Rewards, ends and metrics."""
+    ablation: AblationCfg
+    """What is taken away."""
+    obs: ObsCfg
+    """What the policy sees."""
+    action: ActionCfg
+    """What an action means."""
+    algo: PPOCfg
+    """How the policy learns."""
+    sim: SimCfg
+    """Solver settings."""
+    eval: EvalCfg
+    """How and how often the policy is measured."""
+    checkpoint: CheckpointCfg
+    """How often the run is saved."""
+    tracking: TrackingCfg
+    """Where the run is mirrored to."""
+    seed: int
+    """The one integer from which every random stream comes, 0 or more."""
+    total_frames: int
+    """Length of the training, environment steps over all simulations."""
+    num_envs: int
+    """Simulations side by side."""
+    num_threads: int
+    """Threads for simulation and learning; 0 means all cores."""
+    device: str
+    """Where the learner computes: ``cpu`` or ``cuda``."""
+    run_dir: str
+    """Folder of the run."""
+    resume: str
+    """A run that exists: ``auto`` continues it, ``must`` demands one, ``never`` refuses."""
+    budget: str
+    """Label for reports, such as smoke, reduced or paper."""
+    offline: bool
+    """Whether missing assets are an error instead of being fetched."""
+
+    def validate(self) -> None:
+        """Check what no single field can know.
+
+        Raises:
+            ConfigError: at the first broken rule; the message has the values and the cure.
+        """
+        flat = flatten(dataclasses.asdict(self))
+        _check_choices(flat)
+        _check_ranges(flat)
+        self._check_batch()
+        self._check_hand()
+        self._check_placements()
+        _check_device(self.device)
+        if not self.run_dir.strip():
+            raise ConfigError("run_dir is empty; name a folder, or null for the default")
+        if not self.budget.strip():
+            raise ConfigError("budget is empty; say smoke, reduced or paper")
+
+    def _check_batch(self) -> None:
+        collected = self.num_envs * self.algo.steps_per_env
+        size = self.algo.minibatch_size
+        product = f"num_envs {self.num_envs} * algo.steps_per_env {self.algo.steps_per_env}"
+        if size > collected or collected % size:
+            raise ConfigError(
+                f"algo.minibatch_size {size} does not divide the {collected} samples of an "
+                f"iteration ({product}); choose a divisor such as {_divisor(collected, size)}"
+            )
+
+    def _check_hand(self) -> None:
+        hand = self.hand
+        wrong = [i for i in hand.fingertips if not 0 <= i < len(hand.points)]
+        if wrong:
+            raise ConfigError(
+                f"hand.fingertips has {wrong[0]}, but hand.points has {len(hand.points)} entries: "
+                f"use 0 to {len(hand.points) - 1}"
+            )
+        if self.action.kind == "residual" and hand.num_base_joints != 6:
+            raise ConfigError(
+                f"action.kind=residual carries the wrist on 6 base joints, but hand "
+                f"'{hand.name}' has hand.num_base_joints {hand.num_base_joints}; use action=absolute"
+            )
+
+    def _check_placements(self) -> None:
+        if not self.task.objects:
+            raise ConfigError("task.objects is empty; name at least one object of the library")
+        for i, placement in enumerate(self.task.placements):
+            for name, size in (("pos_m", 3), ("quat", 4)):
+                value = getattr(placement, name)
+                if value is not None and len(value) != size:
+                    raise ConfigError(
+                        f"task.placements[{i}].{name} has {len(value)} numbers, not {size}"
+                    )
+            if placement.quat is not None and sum(q * q for q in placement.quat) == 0:
+                raise ConfigError(f"task.placements[{i}].quat is zero; no rotation is 1, 0, 0, 0")
+
+
+_CHOICES: dict[str, tuple[str, ...]] = {
+    "pregrasp.source": SOURCES,
+    "pregrasp.fallback": SOURCES,
+    "method.name": tuple(METHODS),
+    "ablation.name": ("none",),
+    "obs.layout": ("released", "paper"),
+    "action.kind": ("absolute", "residual"),
+    "hand.gravity_compensation": ("all", "base"),
+    "tracking.kind": ("mlflow", "none"),
+    "resume": ("auto", "never", "must"),
+}
+
+# Lowest value allowed.
+_AT_LEAST: dict[str, int] = {
+    "seed": 0,
+    "total_frames": 1,
+    "num_envs": 1,
+    "num_threads": 0,
+    "hand.num_base_joints": 0,
+    "action.lead_steps": 0,
+    "action.residual_scale": 0,
+    "algo.value_coef": 0,
+    "algo.entropy_coef": 0,
+    "algo.steps_per_env": 1,
+    "algo.minibatch_size": 1,
+    "algo.epochs": 1,
+    "sim.solver_iterations": 1,
+    "sim.noslip_iterations": 0,
+    "eval.episodes": 1,
+    "eval.interval_frames": 0,
+    "checkpoint.keep_last": 1,
+}
+_ABOVE_ZERO = (
+    "task.timestep_s",
+    "method.reward.tracking_scale",
+    "method.termination.max_object_error_m",
+    "method.success_threshold_m",
+    "algo.learning_rate",
+    "algo.adam_eps",
+    "algo.clip",
+    "algo.max_grad_norm",
+    "algo.observation_clip",
+    "checkpoint.interval_s",
+)
+_SHARES = ("algo.gamma", "algo.gae_lambda")
+
+
+def _check_choices(flat: dict[str, object]) -> None:
+    for key, valid in _CHOICES.items():
+        # The strict types have refused None where it means nothing.
+        if flat[key] is not None and flat[key] not in valid:
+            raise UnknownNameError(f"{key} value", str(flat[key]), valid)
+
+
+def _check_ranges(flat: dict[str, object]) -> None:
+    numbers = {k: v for k, v in flat.items() if isinstance(v, int | float)}
+    for key, low in _AT_LEAST.items():
+        if numbers[key] < low:
+            raise ConfigError(f"{key} is {numbers[key]}; it must be at least {low}")
+    for key in _ABOVE_ZERO:
+        if numbers[key] <= 0:
+            raise ConfigError(f"{key} is {numbers[key]}; it must be above 0")
+    for key in _SHARES:
+        if not 0 <= numbers[key] <= 1:
+            raise ConfigError(f"{key} is {numbers[key]}; it must be between 0 and 1")
+    hidden = flat["algo.hidden"]
+    if isinstance(hidden, list) and any(width < 1 for width in hidden):
+        raise ConfigError(f"algo.hidden is {hidden}; every width must be at least 1")
+
+
+def _check_device(device: str) -> None:
+    kind = device.partition(":")[0]
+    if kind not in ("cpu", "cuda"):
+        raise UnknownNameError("device", device, ("cpu", "cuda"))
+    if kind == "cuda":
+        # Asked only here: looking for a GPU takes time, and most runs use none.
+        import torch
+
+        if not torch.cuda.is_available():
+            raise ConfigError(f"device is {device}, but torch finds no GPU here; use device=cpu")
+
+
+def _divisor(total: int, at_most: int) -> int:
+    """Return the largest divisor of ``total`` that is at most ``at_most``."""
+    return next(n for n in range(min(total, at_most), 0, -1) if total % n == 0)

@@ -1,0 +1,169 @@
+"""From names to a typed ExperimentCfg: the only place where Hydra's DictConfig becomes one."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from pgdm.config.groups import available, conf_dir, groups
+from pgdm.config.strict import build, flatten
+from pgdm.errors import ConfigError, UnknownNameError
+
+if TYPE_CHECKING:
+    from pgdm.config.schema import ExperimentCfg
+
+__all__ = [
+    "COMPOSITION_ERRORS",
+    "available",
+    "compose",
+    "conf_dir",
+    "explain",
+    "from_dict_config",
+    "groups",
+]
+
+COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, ValueError)
+"""What Hydra and its YAML reader raise at wrong settings; ``explain`` makes a ConfigError of it."""
+
+# Hydra keeps the current application in process-wide state, which two threads must not swap.
+_LOCK = threading.RLock()
+
+
+def from_dict_config(composed: DictConfig) -> ExperimentCfg:
+    """Turn what Hydra composed into a checked ExperimentCfg.
+
+    Raises:
+        ConfigError: if a key is unknown or missing, or a value is wrong.
+    """
+    # The schema loads the simulator and torch: a wrong name should be answered before that.
+    from pgdm.config.identity import default_run_dir
+    from pgdm.config.schema import ExperimentCfg
+
+    try:
+        plain = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise explain(error) from error
+    assert isinstance(plain, dict)
+    data = {str(key): value for key, value in plain.items()}
+    chosen = data.get("run_dir")
+    cfg = build(ExperimentCfg, data | {"run_dir": "." if chosen is None else chosen})
+    cfg.validate()
+    return cfg if chosen is not None else dataclasses.replace(cfg, run_dir=default_run_dir(cfg))
+
+
+def compose(
+    overrides: Sequence[str] = (), config_dir: str | os.PathLike[str] | None = None
+) -> ExperimentCfg:
+    """Compose an experiment as ``pgdm-run`` would, with or without a Hydra app around.
+
+    Args:
+        overrides: as on the command line, such as ``["task=cup-pour1", "seed=3"]``.
+        config_dir: a folder of your own settings, searched before pgdm's.
+
+    Raises:
+        ConfigError: if a key, an option or a value is wrong.
+    """
+    folder = None if config_dir is None else str(Path(config_dir).expanduser().absolute())
+    if folder is not None and not Path(folder).is_dir():
+        raise ConfigError(f"config_dir '{folder}' is not a folder")
+    return _typed(tuple(overrides), folder, _stamp(folder))
+
+
+def _stamp(folder: str | None) -> int:
+    """Return when the settings last changed, so that an edited file is read anew."""
+    folders = [conf_dir()] if folder is None else [conf_dir(), Path(folder)]
+    files = [path for one in folders for path in one.rglob("*.yaml")]
+    return hash(tuple((str(path), path.stat().st_mtime_ns) for path in files))
+
+
+@lru_cache(maxsize=256)
+def _typed(overrides: tuple[str, ...], folder: str | None, _stamp: int) -> ExperimentCfg:
+    return from_dict_config(_composed(overrides, folder))
+
+
+def _composed(overrides: Sequence[str], folder: str | None = None) -> DictConfig:
+    search = [] if folder is None else [f"hydra.searchpath=[{_quoted(f'file://{folder}')}]"]
+    try:
+        with _LOCK, _own_hydra(), hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return hydra.compose("config", overrides=[*search, *overrides])
+    except COMPOSITION_ERRORS as error:
+        raise explain(error) from error
+
+
+@contextmanager
+def _own_hydra() -> Iterator[None]:
+    """Set the running Hydra application aside, if there is one."""
+    running = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().hydra = running
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{escaped}'"
+
+
+def explain(error: Exception) -> ConfigError:
+    """Return what an error of COMPOSITION_ERRORS means for a user, as one line.
+
+    Args:
+        error: what Hydra, OmegaConf or the YAML reader raised.
+    """
+    text = " ".join(str(error).split())
+    for tail in (" full_key:", " Config search path:", " object_type="):
+        text = text.partition(tail)[0]
+    if isinstance(error, MissingConfigException):
+        return _explain_missing(error, text)
+    if isinstance(error, OverrideParseException):
+        return ConfigError(f"cannot read '{error.override}'; write key=value, such as seed=3")
+    if isinstance(error, YAMLError):
+        return ConfigError(f"a settings file is not valid YAML: {text}")
+    return _explain_text(text)
+
+
+def _explain_text(text: str) -> ConfigError:
+    if text.startswith("Ambiguous value"):
+        argument = text.partition("'")[2].partition("'")[0]
+        return ConfigError(
+            f"'{argument}' has several values; add -m to run one after the other, or write a list "
+            f"as {argument.partition('=')[0]}=[a,b]"
+        )
+    taken = re.search(r"An item is already at '([^']+)'", text)
+    if taken:
+        return ConfigError(f"'{taken[1]}' exists already; leave out the + before it")
+    wrong = re.search(r"Could not (?:override|delete).*? '~?([^']+)'", text)
+    if wrong and wrong[1] == "experiment":
+        return ConfigError("an experiment is added with a plus: +experiment=NAME")
+    if wrong:
+        return UnknownNameError("key", wrong[1], _known_names(), "(pgdm-run --help lists them)")
+    return ConfigError(text)
+
+
+def _explain_missing(error: MissingConfigException, text: str) -> ConfigError:
+    group, _, option = (error.missing_cfg_file or "").rpartition("/")
+    if group and error.options:
+        return UnknownNameError(group, option, [o for o in error.options if o[0] != "_"])
+    return ConfigError(text)
+
+
+def _known_names() -> list[str]:
+    """Return all keys of the default experiment, dotted, and all groups."""
+    plain: Any = OmegaConf.to_container(_composed(()), resolve=False)
+    return sorted({*flatten(plain), *groups()})

@@ -1,0 +1,105 @@
+"""Plain data -> frozen dataclasses, and nothing is guessed: names and types must be right."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Mapping
+from functools import cache
+from typing import Any, TypeVar
+
+from pgdm.errors import ConfigError, UnknownNameError
+
+T = TypeVar("T")
+
+_KIND = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
+
+
+@cache
+def _hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls)
+
+
+def build(cls: type[T], data: object, path: str = "") -> T:
+    """Build a dataclass, and the dataclasses inside it, from plain data.
+
+    Args:
+        cls: the dataclass; its fields may be bool, int, float, str, lists, dataclasses or one of
+            these or None.
+        data: a mapping with exactly its fields. A whole number is a valid float, and a float
+            without a fraction (1e6) a valid int; nothing else is converted.
+        path: where the data stands in the whole, for the messages.
+
+    Raises:
+        ConfigError: if a key is missing or unknown, or a value has the wrong type.
+    """
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{path or 'the configuration'}: {_show(data)} is not a set of keys")
+    hints = _hints(cls)
+    names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    for key in data:
+        if key not in names:
+            # Only the last part differs, so that the nearest names are compared without the rest.
+            where = f"key of '{path}'" if path else "key"
+            raise UnknownNameError(where, str(key), names)
+    missing = [_join(path, name) for name in names if name not in data]
+    if missing:
+        raise ConfigError(f"missing {', '.join(missing)}; give a value, such as {missing[0]}=...")
+    return cls(**{name: _value(hints[name], data[name], _join(path, name)) for name in names})
+
+
+def _value(hint: Any, value: object, path: str) -> Any:  # noqa: ANN401 (any type of a field)
+    origin = typing.get_origin(hint)
+    if origin in (types.UnionType, typing.Union):
+        inner = [option for option in typing.get_args(hint) if option is not type(None)]
+        return None if value is None else _value(inner[0], value, path)
+    if value is None:
+        raise ConfigError(f"{path}: null is not allowed here; it must be {_name(hint)}")
+    if origin is list:
+        if not isinstance(value, list):
+            raise ConfigError(f"{path}: {_show(value)} is not a list, such as {path}=[a,b]")
+        (item,) = typing.get_args(hint)
+        return [_value(item, entry, f"{path}[{i}]") for i, entry in enumerate(value)]
+    if dataclasses.is_dataclass(hint):
+        return build(typing.cast(type, hint), value, path)
+    return _scalar(hint, value, path)
+
+
+def _scalar(kind: type, value: object, path: str) -> bool | int | float | str:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if kind is float and is_number:
+        if not math.isfinite(value):
+            raise ConfigError(f"{path}: {value} is not a finite number")
+        return float(value)
+    if kind is int and is_number and float(value).is_integer():
+        return int(value)
+    if kind in (bool, str) and isinstance(value, kind):
+        return value
+    hint = f"; write {path}=\"'{value}'\" to mean text" if kind is str else ""
+    raise ConfigError(f"{path}: {_show(value)} is not {_name(kind)}{hint}")
+
+
+def _name(hint: Any) -> str:  # noqa: ANN401 (any type of a field)
+    if typing.get_origin(hint) is list:
+        return "a list"
+    return _KIND.get(hint, "a set of keys")
+
+
+def _show(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def flatten(data: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+    """Return nested data as one dict with dotted keys; lists stay whole."""
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        name = _join(path, str(key))
+        flat.update(flatten(value, name) if isinstance(value, Mapping) else {name: value})
+    return flat
