@@ -1,0 +1,10 @@
+"""The asset library: hands, objects, scenes and motions, normalised, with their provenance."""
+
+from __future__ import annotations
+
+from pgdm.library.catalog import Library, open_library
+from pgdm.library.motion_file import Motion, Start
+from pgdm.library.report import Report
+from pgdm.library.tcdm import import_tcdm
+
+__all__ = ["Library", "Motion", "Report", "Start", "import_tcdm", "open_library"]

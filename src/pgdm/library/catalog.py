@@ -1,0 +1,156 @@
+"""What the library holds and which source serves it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from pgdm import paths
+from pgdm.errors import LibraryError, UnknownNameError
+from pgdm.library import manifest as manifests
+from pgdm.library import motion_file, staging
+from pgdm.library.manifest import Manifest, TaskEntry
+from pgdm.library.motion_file import Motion
+
+CURE = "Fill the library with 'pgdm assets fetch' or 'pgdm assets import PATH' (a TCDM checkout)."
+"""What to do when the library lacks something."""
+
+
+class Library:
+    """The assets under one root, from one or two sources; a checkout wins, task by task.
+
+    A task takes hand, objects, scene and motion all from the source that serves it.
+
+    Args:
+        root: the library's folder.
+        sources: manifests by source name, the winning source first.
+        folders: folder of each source.
+    """
+
+    def __init__(
+        self, root: Path, sources: dict[str, Manifest], folders: dict[str, Path]
+    ) -> None:
+        self.root, self._sources, self._folders = root, sources, folders
+
+    def sources(self) -> dict[str, Manifest]:
+        """Return the manifest of each source that is present, the winning one first."""
+        return dict(self._sources)
+
+    def tasks(self) -> dict[str, str]:
+        """Return the source that serves each task, by task id."""
+        found: dict[str, str] = {}
+        for source, manifest in self._sources.items():
+            for task in manifest.tasks:
+                found.setdefault(task, source)
+        return dict(sorted(found.items()))
+
+    def hands(self) -> list[str]:
+        """Return the names of the hands."""
+        return sorted({name for m in self._sources.values() for name in m.hands})
+
+    def objects(self) -> list[str]:
+        """Return the names of the objects."""
+        return sorted({name for m in self._sources.values() for name in m.objects})
+
+    def entry(self, task: str, source: str | None = None) -> TaskEntry:
+        """Return hand, objects, length and stored starts of a task.
+
+        Raises:
+            UnknownNameError: the task is not in the library (or not from that source).
+        """
+        return self._sources[self._source(task, source)].tasks[task]
+
+    def source_of(self, task: str) -> str:
+        """Return the source that serves a task.
+
+        Raises:
+            UnknownNameError: the task is not in the library.
+        """
+        return self._source(task, None)
+
+    def motion(self, motion_id: str, source: str | None = None) -> Motion:
+        """Read a task's motion.
+
+        Raises:
+            UnknownNameError: the task is not in the library (or not from that source).
+            CorruptAssetError: its file is damaged.
+        """
+        source = self._source(motion_id, source)
+        return motion_file.read(self.motion_path(motion_id, source), motion_id, source)
+
+    def motion_path(self, motion_id: str, source: str | None = None) -> Path:
+        """Return the file of a task's motion."""
+        source = self._source(motion_id, source)
+        return self._existing(source, f"motions/{motion_id}.npz")
+
+    def hand_xml(self, hand: str, source: str | None = None) -> Path:
+        """Return the MJCF file of a hand with its actuators.
+
+        Raises:
+            UnknownNameError: the hand is not in the library (or not from that source).
+        """
+        found = self._serving("hand", hand, source, {s: m.hands for s, m in self._sources.items()})
+        return self._existing(found, f"hands/{hand}/hand.xml")
+
+    def object_xml(self, object_name: str, source: str | None = None) -> Path:
+        """Return the MJCF file of an object.
+
+        Raises:
+            UnknownNameError: the object is not in the library (or not from that source).
+        """
+        have = {s: m.objects for s, m in self._sources.items()}
+        found = self._serving("object", object_name, source, have)
+        return self._existing(found, f"objects/{object_name}/object.xml")
+
+    def scene_xml(self, source: str | None = None) -> Path:
+        """Return the MJCF file of the table scene.
+
+        Raises:
+            LibraryError: the library is empty.
+        """
+        found = self._serving("scene", "table", source, dict.fromkeys(self._sources, ["table"]))
+        return self._existing(found, "scene/table.xml")
+
+    def _source(self, task: str, source: str | None) -> str:
+        have = {s: list(m.tasks) for s, m in self._sources.items()}
+        return self._serving("task", task, source, have)
+
+    def _serving(
+        self, kind: str, name: str, source: str | None, have: dict[str, list[str]]
+    ) -> str:
+        if not have:
+            raise LibraryError(f"the asset library in {self.root} is empty. {CURE}")
+        if source is not None and source not in have:
+            raise UnknownNameError("library source", source, have, CURE)
+        asked: Iterable[str] = have if source is None else [source]
+        for candidate in asked:
+            if name in have[candidate]:
+                return candidate
+        valid = {n for s in asked for n in have[s]}
+        raise UnknownNameError(kind, name, valid, CURE)
+
+    def _existing(self, source: str, relative: str) -> Path:
+        path = self._folders[source] / relative
+        if not path.is_file():
+            raise LibraryError(
+                f"{path}: missing from the library, though its manifest lists it. {CURE}"
+            )
+        return path
+
+
+def open_library(root: Path | None = None) -> Library:
+    """Open the library; reads its manifests only.
+
+    Args:
+        root: its folder, by default the one under ``PGDM_HOME``.
+
+    Raises:
+        CorruptAssetError: a manifest is damaged.
+    """
+    root = paths.library() if root is None else Path(root)
+    folders: dict[str, Path] = {}
+    for source in staging.SOURCES:
+        folder = staging.folder_of(root, source)
+        if folder is not None:
+            folders[source] = folder
+    return Library(root, {s: manifests.read(f) for s, f in folders.items()}, folders)

@@ -1,0 +1,169 @@
+"""Making one self-contained MJCF file, with its meshes and textures, from a model and includes."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from pgdm.errors import CorruptAssetError
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NUMERIC = frozenset(
+    "pos quat euler axisangle xyaxes zaxis axis range size fromto mass diaginertia fullinertia "
+    "damping armature frictionloss stiffness margin gap friction density scale rgba ctrlrange kp "
+    "forcerange gear solref solimp condim contype conaffinity coef".split()
+)
+_DROPPED = frozenset("njmax nconmax nstack apirate collision mpr_iterations mpr_tolerance".split())
+"""Attributes of ``size`` and ``option`` that MuJoCo once had and now refuses; none changes a
+trajectory: the first three only bounded memory."""
+
+
+def parse(path: Path, defects: list[str], root: Path) -> ET.Element:
+    """Parse an MJCF file and put its includes in place.
+
+    File attributes become absolute; numbers with a typing error are read as MuJoCo once read them
+    and reported.
+
+    Args:
+        path: the file.
+        defects: messages about what was repaired are added here.
+        root: folder to which names in messages are relative; includes must not leave it.
+
+    Raises:
+        CorruptAssetError: a file is missing, damaged, or includes itself or something outside.
+    """
+    return _parse(Path(os.path.abspath(path)), defects, Path(os.path.abspath(root)), ())
+
+
+def _parse(path: Path, defects: list[str], root: Path, parents: tuple[Path, ...]) -> ET.Element:
+    label = _label(path, root)
+    if path in parents:
+        raise CorruptAssetError(f"{label}: includes itself")
+    try:
+        element = ET.fromstring(path.read_bytes())
+    except ET.ParseError as error:
+        raise CorruptAssetError(f"{label}: not well-formed XML ({error})") from error
+    except OSError as error:
+        raise CorruptAssetError(f"{label}: cannot be read ({error.strerror})") from error
+    for item in element.iter():
+        _repair(item, label, defects)
+        reference = item.get("file")
+        if reference is not None:
+            item.set("file", str(_inside(path.parent / reference, root, label)))
+    _include(element, lambda target: _parse(Path(target), defects, root, (*parents, path)))
+    return element
+
+
+def _label(path: Path, root: Path) -> str:
+    return str(path.relative_to(root)) if path.is_relative_to(root) else path.name
+
+
+def _inside(path: Path, root: Path, label: str) -> Path:
+    # Lexically: a checkout may keep its submodules behind links.
+    path = Path(os.path.normpath(path))
+    if not path.is_relative_to(root):
+        raise CorruptAssetError(f"{label}: refers to '{path}', which lies outside the data tree")
+    return path
+
+
+def _include(element: ET.Element, load: Callable[[str], ET.Element]) -> None:
+    children: list[ET.Element] = []
+    for child in element:
+        if child.tag == "include":
+            children.extend(load(child.get("file", "")))
+        else:
+            _include(child, load)
+            children.append(child)
+    element[:] = children
+
+
+def _repair(item: ET.Element, label: str, defects: list[str]) -> None:
+    if item.tag in ("size", "option"):
+        for key in _DROPPED & set(item.attrib):
+            del item.attrib[key]
+    for key in _NUMERIC & set(item.attrib):
+        tokens = item.attrib[key].split()
+        read = [_number(token) for token in tokens]
+        if all(token == number for token, number in zip(tokens, read, strict=True)):
+            continue
+        if any(number is None for number in read):
+            raise CorruptAssetError(f'{label}: {item.tag} {key}="{item.attrib[key]}" has no number')
+        fixed = " ".join(str(number) for number in read)
+        defects.append(f'{label}: {item.tag} {key}="{item.attrib[key]}" read as "{fixed}"')
+        item.set(key, fixed)
+
+
+def _number(token: str) -> str | None:
+    if token.lower() in ("true", "false", "auto"):
+        return token
+    match = _NUMBER.match(token)
+    return match.group() if match else None
+
+
+def inline_defaults(model: ET.Element, common: ET.Element) -> None:
+    """Put the assets and defaults of ``common`` at the front of a model that lacks them.
+
+    In the released environment a robot attached to the table scene inherited that scene's main
+    default class, so the models whose own file does not include it need it as well.
+    """
+    if any(d.get("class") == "object_contact" for d in model.iter("default")):
+        return
+    parts = [c for c in common if c.tag in ("asset", "default")]
+    model[:] = [*parts, *model]
+
+
+def write(model: ET.Element, path: Path, note: str) -> list[tuple[Path, Path]]:
+    """Write a model with its files beside it, in ``meshes/`` and ``textures/``.
+
+    Args:
+        model: as from :func:`parse`; changed in place.
+        path: the file to write.
+        note: one line about its origin, kept as a comment.
+
+    Returns:
+        Pairs (written file, file it was copied from), the model's own file not among them.
+
+    Raises:
+        CorruptAssetError: a mesh or texture is missing.
+    """
+    _one_compiler(model)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    copied: dict[Path, Path] = {}
+    for item in _with_files(model):
+        origin = Path(item.attrib["file"])
+        folder = "textures" if item.tag == "texture" else "meshes"
+        target = path.parent / folder / origin.name
+        if item.get("name") is None:
+            item.set("name", origin.stem)
+        if copied.get(target, origin) != origin:
+            target = target.with_name(f"{origin.parent.name}_{origin.name}")
+        if target not in copied:
+            if not origin.is_file():
+                raise CorruptAssetError(f"{path.name}: its file '{origin.name}' is missing")
+            target.parent.mkdir(exist_ok=True)
+            shutil.copyfile(origin, target)
+            copied[target] = origin
+        item.set("file", target.relative_to(path.parent).as_posix())
+    ET.indent(model)
+    text = ET.tostring(model, encoding="unicode")
+    path.write_text(f"<!-- {note.replace('--', '- -')} -->\n{text}\n", encoding="utf-8")
+    return list(copied.items())
+
+
+def missing_files(model: ET.Element) -> list[str]:
+    """Return the names of the files that a parsed model refers to and that do not exist."""
+    return [i.attrib["file"] for i in _with_files(model) if not Path(i.attrib["file"]).is_file()]
+
+
+def _with_files(model: ET.Element) -> Iterable[ET.Element]:
+    return (i for i in model.iter() if i.tag in ("mesh", "texture", "hfield") and i.get("file"))
+
+
+def _one_compiler(model: ET.Element) -> None:
+    for old in model.findall("compiler"):
+        model.remove(old)
+    model.insert(0, ET.Element("compiler", angle="radian"))

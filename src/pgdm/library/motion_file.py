@@ -1,0 +1,161 @@
+"""The motion of a task in its normalised form: plain arrays, checked."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pgdm.errors import CorruptAssetError
+from pgdm.library import safe_npz
+
+STARTS = ("planned", "mined", "learned")
+"""Names of the start states that a motion may carry."""
+
+_UNIT_TOLERANCE = 1e-3
+"""How far a stored quaternion's norm may be from 1; the released files are within 1e-6."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """A start state of the whole scene, hand first, then the objects."""
+
+    qpos: np.ndarray = field(repr=False)
+    """Joint positions (nq,), m and rad."""
+    qvel: np.ndarray = field(repr=False)
+    """Joint velocities (nv,), m/s and rad/s."""
+    actions: np.ndarray | None = field(repr=False)
+    """Normalised actions (K, nu) of the reach plan that leads here, where one is stored."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """An exemplar object motion with the start states stored beside it."""
+
+    id: str
+    """Task id the motion belongs to."""
+    source: str
+    """Library source that serves it: ``checkout`` or ``registry``."""
+    translation: np.ndarray = field(repr=False)
+    """Target of the object's centre of mass (T, 3), m, world frame."""
+    orientation: np.ndarray = field(repr=False)
+    """Target of the object body's orientation (T, 4), unit quaternion wxyz."""
+    substeps: int
+    """Physics steps per control step."""
+    starts: Mapping[str, Start] = field(repr=False)
+    """Start states by name, of :data:`STARTS` those that are stored."""
+    sha256: str
+    """Hash of the motion's file in the library."""
+
+
+def check(
+    arrays: Mapping[str, Any], label: str
+) -> tuple[np.ndarray, np.ndarray, int, dict[str, Start]]:
+    """Check the arrays of a normalised motion and return its parts.
+
+    Args:
+        arrays: as in the normalised file.
+        label: the file's name, for messages.
+
+    Raises:
+        CorruptAssetError: an array is missing, has a wrong shape, NaN, or no unit quaternions.
+    """
+    translation = numbers(arrays, "object_translation", label, (None, 3))
+    steps = len(translation)
+    if steps < 2:
+        raise CorruptAssetError(f"{label}: object_translation has {steps} rows, needs 2 or more")
+    orientation = numbers(arrays, "object_orientation", label, (steps, 4))
+    norms = np.linalg.norm(orientation, axis=1)
+    worst = int(np.abs(norms - 1.0).argmax())
+    if abs(norms[worst] - 1.0) > _UNIT_TOLERANCE:
+        raise CorruptAssetError(
+            f"{label}: object_orientation row {worst} has norm {norms[worst]:.4g}, "
+            "not a unit quaternion"
+        )
+    substeps = float(numbers(arrays, "substeps", label, ()))
+    if not 1 <= substeps <= 1000 or substeps != int(substeps):
+        raise CorruptAssetError(f"{label}: substeps is {substeps}, not a whole number from 1")
+    starts = {}
+    for name in STARTS:
+        if f"start_{name}_qpos" in arrays:
+            starts[name] = _start(arrays, name, label)
+    return translation, orientation, int(substeps), starts
+
+
+def _start(arrays: Mapping[str, Any], name: str, label: str) -> Start:
+    qpos = numbers(arrays, f"start_{name}_qpos", label, (None,))
+    # The scenes have only one-degree-of-freedom joints: as many velocities as positions.
+    qvel = numbers(arrays, f"start_{name}_qvel", label, (len(qpos),))
+    actions = None
+    if f"start_{name}_actions" in arrays:
+        actions = numbers(arrays, f"start_{name}_actions", label, (None, None))
+    return Start(qpos, qvel, actions)
+
+
+def numbers(
+    arrays: Mapping[str, Any], key: str, label: str, shape: tuple[int | None, ...]
+) -> np.ndarray:
+    """Return a finite float64 array of a given shape, None standing for any length.
+
+    Raises:
+        CorruptAssetError: it is missing, not numeric, of another shape, or not finite.
+    """
+    if key not in arrays:
+        raise CorruptAssetError(f"{label}: lacks '{key}'; it has {', '.join(sorted(arrays))}")
+    value = np.asarray(arrays[key])
+    if value.dtype.kind not in "biuf":
+        raise CorruptAssetError(f"{label}: '{key}' is not numeric (dtype {value.dtype})")
+    fits = value.ndim == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, value.shape, strict=True)
+    )
+    if not fits:
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        raise CorruptAssetError(f"{label}: '{key}' has shape {value.shape}, expected {wanted}")
+    value = value.astype(np.float64)
+    if not np.isfinite(value).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
+        raise CorruptAssetError(f"{label}: '{key}' has a NaN or infinite value at {where}")
+    return value
+
+
+def pack(
+    translation: np.ndarray, orientation: np.ndarray, substeps: int, starts: Mapping[str, Start]
+) -> dict[str, np.ndarray]:
+    """Return the arrays of the normalised file."""
+    arrays = {
+        "object_translation": np.asarray(translation, np.float64),
+        "object_orientation": np.asarray(orientation, np.float64),
+        "substeps": np.asarray(substeps, np.int64),
+    }
+    for name, start in starts.items():
+        arrays[f"start_{name}_qpos"] = np.asarray(start.qpos, np.float64)
+        arrays[f"start_{name}_qvel"] = np.asarray(start.qvel, np.float64)
+        if start.actions is not None:
+            arrays[f"start_{name}_actions"] = np.asarray(start.actions, np.float64)
+    return arrays
+
+
+def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Check and write a normalised motion; the same arrays always give the same bytes."""
+    check(arrays, path.name)
+    buffer = io.BytesIO()
+    # np.savez writes a fixed date into the zip, so the file's hash depends on the arrays only.
+    np.savez_compressed(buffer, **dict(arrays))  # type: ignore[arg-type]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(buffer.getvalue())
+
+
+def read(path: Path, motion_id: str, source: str) -> Motion:
+    """Read a normalised motion.
+
+    Raises:
+        CorruptAssetError: the file is missing, damaged, or holds impossible values.
+    """
+    translation, orientation, substeps, starts = check(safe_npz.read_npz(path), str(path))
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return Motion(motion_id, source, translation, orientation, substeps, starts, digest)
