@@ -1,0 +1,252 @@
+"""Pictures and films of a scene, with the goal as a translucent ghost."""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from pgdm.errors import RenderError
+from pgdm.sim.camera import camera_for
+from pgdm.sim.gl import context_class
+
+MAX_GEOMS = 2000
+GHOST_RGBA = np.array([0.15, 0.95, 0.45, 0.35], np.float32)
+# Software OpenGL: a frame of 640x480 costs about 75 ms with these, 230 ms with the scene's own.
+SHADOW_SIZE = 1024
+SAMPLES = 4
+VIDEO_FPS = 25  # control steps a second (SPEC 1): films run at the speed of the task
+
+
+class Renderer:
+    """Draws one scene; keep it for many frames.
+
+    Args:
+        model: the compiled scene.
+        object_body: id of the tracked body; what is rigidly attached to it is drawn as the ghost.
+        width: of the pictures, pixels.
+        height: of the pictures, pixels.
+        motion: positions of the object's centre of mass that the picture should show, (T, 3) m,
+            usually the task's exemplar motion; None shows the middle of the table.
+
+    Raises:
+        RenderError: if no OpenGL works here.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        object_body: int,
+        width: int = 640,
+        height: int = 480,
+        motion: np.ndarray | None = None,
+    ) -> None:
+        self.model, self.width, self.height = model, width, height
+        self._object_body = object_body
+        self._com = model.body_ipos[object_body].copy()  # (3,) m, of the COM in the body's frame
+        attached = model.body_weldid == model.body_weldid[object_body]
+        self._ghost_geoms = frozenset(np.flatnonzero(attached[model.geom_bodyid]).tolist())
+        self._data = mujoco.MjData(model)
+        self._scene = mujoco.MjvScene(model, MAX_GEOMS)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._option = mujoco.MjvOption()
+        self._camera = camera_for(model, motion, width / height)
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._gl, self._mjr = _open(model, width, height)
+        self._free = weakref.finalize(self, _close, self._gl, self._mjr)
+
+    def render(
+        self,
+        data: mujoco.MjData,
+        goal: tuple[np.ndarray, np.ndarray] | None = None,
+        caption: str = "",
+    ) -> np.ndarray:
+        """Draw a state.
+
+        Args:
+            data: the state, with current kinematics.
+            goal: where the object should be: its centre of mass (3,) m and its orientation (4,)
+                wxyz, world frame; None draws no ghost.
+            caption: text in the upper left corner.
+
+        Returns:
+            The picture, (height, width, 3) uint8.
+
+        Raises:
+            RenderError: after ``close``.
+        """
+        if not self._free.alive:
+            raise RenderError("this renderer is closed")
+        self._gl.make_current()
+        every = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(
+            self.model, data, self._option, None, self._camera, every, self._scene
+        )
+        for light in self._scene.lights[: self._scene.nlight - 1]:
+            light.castshadow = False  # each shadow costs one more pass over the scene
+        if goal is not None:
+            self._add_ghost(data, *goal)
+        mujoco.mjr_render(self._rect, self._scene, self._mjr)
+        if caption:
+            font, corner = mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT
+            mujoco.mjr_overlay(font, corner, self._rect, caption, "", self._mjr)
+        pixels = np.empty((self.height, self.width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self._rect, self._mjr)
+        return pixels[::-1].copy()  # OpenGL's first row is the lowest
+
+    def render_qpos(
+        self,
+        qpos: np.ndarray,
+        goal: tuple[np.ndarray, np.ndarray] | None = None,
+        caption: str = "",
+    ) -> np.ndarray:
+        """Draw joint positions qpos (nq,); otherwise as ``render``."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self._data)
+        mujoco.mj_comPos(self.model, self._data)
+        mujoco.mj_camlight(self.model, self._data)
+        return self.render(self._data, goal, caption)
+
+    def close(self) -> None:
+        """Give back what OpenGL holds; harmless when called twice."""
+        self._free()
+
+    def __enter__(self) -> Renderer:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close."""
+        self.close()
+
+    def _add_ghost(self, data: mujoco.MjData, com: np.ndarray, quat: np.ndarray) -> None:
+        """Add the object's visible geoms once more, moved from where it is to the goal."""
+        goal_rot = np.empty(9)
+        mujoco.mju_quat2Mat(goal_rot, np.asarray(quat, float))
+        goal_rot = goal_rot.reshape(3, 3)
+        goal_pos = np.asarray(com, float) - goal_rot @ self._com  # the goal is the COM's
+        turn = goal_rot @ data.xmat[self._object_body].reshape(3, 3).T
+        start = data.xpos[self._object_body]
+        kind = mujoco.mjtObj.mjOBJ_GEOM
+        shown = [
+            geom
+            for geom in self._scene.geoms[: self._scene.ngeom]
+            if geom.objtype == kind and geom.objid in self._ghost_geoms
+        ]
+        for geom in shown[: self._scene.maxgeom - self._scene.ngeom]:
+            ghost = self._scene.geoms[self._scene.ngeom]
+            pos = goal_pos + turn @ (geom.pos - start)
+            mat = (turn @ geom.mat).ravel()
+            mujoco.mjv_initGeom(ghost, geom.type, geom.size, pos, mat, GHOST_RGBA)
+            ghost.dataid = geom.dataid
+            ghost.category = mujoco.mjtCatBit.mjCAT_DECOR
+            self._scene.ngeom += 1
+
+
+def _open(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
+    """Make the OpenGL context and upload the scene's meshes and textures."""
+    try:
+        context = context_class()(width, height)
+        context.make_current()
+    except (ImportError, RuntimeError, AttributeError, OSError) as error:
+        raise RenderError(f"OpenGL does not start: {error}") from error
+    glob, quality = model.vis.global_, model.vis.quality
+    before = glob.offwidth, glob.offheight, quality.offsamples, quality.shadowsize
+    # The scene's own off-screen buffer is 3024x1680 with 8 samples: 300 MB in software OpenGL.
+    glob.offwidth, glob.offheight = width, height
+    quality.offsamples, quality.shadowsize = SAMPLES, SHADOW_SIZE
+    try:
+        resources = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    except mujoco.FatalError as error:
+        raise RenderError(f"OpenGL does not start: {error}") from error
+    finally:
+        glob.offwidth, glob.offheight, quality.offsamples, quality.shadowsize = before
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, resources)
+    return context, resources
+
+
+def _close(context: Any, resources: mujoco.MjrContext) -> None:  # noqa: ANN401 - any backend's
+    with context.as_current():
+        resources.free()
+    context.free()
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = VIDEO_FPS) -> Path:
+    """Write an MP4 (H.264, yuv420p: plays in every browser) and its poster.
+
+    Args:
+        path: of the MP4; it appears only when complete, replacing an older one.
+        frames: pictures (H, W, 3) uint8, all of one size, at least one. Odd sizes lose their
+            last row or column.
+        fps: pictures per second.
+
+    Returns:
+        The poster's path, ``path`` with suffix ``.png``: the picture in the film's middle.
+
+    Raises:
+        RenderError: if there is no frame, or the file cannot be written.
+    """
+    import imageio_ffmpeg
+
+    pictures = [_even(frame) for frame in frames]
+    if not pictures:
+        raise RenderError(f"no frames for {path}")
+    height, width = pictures[0].shape[:2]
+    temp = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer = imageio_ffmpeg.write_frames(
+            str(temp),
+            (width, height),
+            fps=fps,
+            codec="libx264",
+            pix_fmt_out="yuv420p",
+            macro_block_size=2,
+            output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"],
+            ffmpeg_log_level="error",
+        )
+        writer.send(None)
+        for picture in pictures:
+            writer.send(picture)
+        writer.close()
+        os.replace(temp, path)
+    except (OSError, RuntimeError) as error:
+        raise RenderError(f"cannot write {path}: {error}") from error
+    finally:
+        temp.unlink(missing_ok=True)
+    return write_image(path.with_suffix(".png"), pictures[len(pictures) // 2])
+
+
+def write_image(path: Path, picture: np.ndarray) -> Path:
+    """Write a picture (H, W, 3) uint8 as PNG, whole or not at all.
+
+    Raises:
+        RenderError: if the file cannot be written.
+    """
+    from PIL import Image
+
+    temp = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        Image.fromarray(picture).save(temp, format="png")
+        os.replace(temp, path)
+    except OSError as error:
+        raise RenderError(f"cannot write {path}: {error}") from error
+    finally:
+        temp.unlink(missing_ok=True)
+    return path
+
+
+def _even(frame: np.ndarray) -> np.ndarray:
+    height, width = frame.shape[0] // 2 * 2, frame.shape[1] // 2 * 2
+    return np.ascontiguousarray(frame[:height, :width])
