@@ -176,7 +176,7 @@ def _open(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.M
     return context, resources
 
 
-def _close(context: Any, resources: mujoco.MjrContext) -> None:  # noqa: ANN401 - any backend's
+def _close(context: Any, resources: mujoco.MjrContext) -> None:
     with context.as_current():
         resources.free()
     context.free()
