@@ -1,0 +1,79 @@
+# Every target sets up .venv from nothing and is quick when nothing changed.
+#
+#   make run     the main job on real data: about four minutes of training, then a table and a video
+#   make test    the tests
+#   make check   lint, format, types, layers
+#   make slow    the tests that take minutes
+#   make docs    the documentation site, built strictly
+#   make clean   remove what the other targets made (never your runs)
+#
+# More options for the program behind run, test and slow go into ARGS: make test ARGS="-k rotations -x".
+
+VENV := .venv
+BIN := $(VENV)/bin
+ARGS :=
+
+# Named so that a machine whose python3 is older still works.
+PYTHON := $(shell command -v python3.11 || command -v python3)
+INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
+SOURCES := pyproject.toml constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help setup dev run test slow check lint format types layers docs serve clean
+
+help:
+	@sed -n '2,/^$$/s/^# \{0,1\}//p' $(firstword $(MAKEFILE_LIST))
+
+# pip and the stamps are written last, so an interrupted installation is taken up again.
+$(BIN)/pip:
+	@test -n "$(PYTHON)" || { echo "No python3 found: install Python 3.11 or newer."; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "$(PYTHON) is too old: pgdm needs Python 3.11 or newer. Name one with PYTHON=..."; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null \
+		|| { echo "$(PYTHON) cannot make environments: on Debian, apt-get install python3-venv."; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.run: $(SOURCES) | $(BIN)/pip
+	@echo "Installing into $(VENV) (a few minutes, once)"
+	$(INSTALL) --editable .
+	@touch $@
+
+$(VENV)/.dev: $(SOURCES) | $(BIN)/pip
+	@echo "Installing into $(VENV), development tools included (a few minutes, once)"
+	$(INSTALL) --editable '.[dev]'
+	@touch $@ $(VENV)/.run
+
+setup: $(VENV)/.run
+dev: $(VENV)/.dev
+
+run: setup
+	$(BIN)/pgdm-run +experiment=quickstart $(ARGS)
+
+test: dev
+	$(BIN)/python -m pytest $(ARGS)
+
+slow: dev
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+check: lint format types layers
+
+lint: dev
+	$(BIN)/ruff check .
+
+format: dev
+	$(BIN)/ruff format --check .
+
+types: dev
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+layers: dev
+	$(BIN)/python -m pytest -q tests/test_layers.py
+
+docs: dev
+	$(BIN)/mkdocs build --strict
+
+serve: dev
+	$(BIN)/mkdocs serve
+
+clean:
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,77 @@
+"""Keeps every test away from the user's own data, and offers a library filled from a checkout."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+
+import pgdm.library
+
+CACHE = Path(tempfile.gettempdir()) / f"pgdm-tests-{os.getuid()}"
+MISSING = CACHE / f"missing-{os.getpid()}"
+CHECKOUT: Path | None = None
+if os.environ.get("PGDM_TCDM_ROOT"):
+    CHECKOUT = Path(os.environ["PGDM_TCDM_ROOT"]).absolute()
+    os.environ["PGDM_TCDM_ROOT"] = str(CHECKOUT)  # tests change the working directory
+
+
+def _digest(checkout: Path) -> str:
+    """Return a name that changes with the checkout's files and with the code that reads them."""
+    digest = hashlib.sha256()
+    for path in sorted(p for p in checkout.rglob("*") if p.is_file()):
+        stat = path.stat()
+        digest.update(f"{path.relative_to(checkout)} {stat.st_size} {stat.st_mtime_ns}".encode())
+    for source in sorted(Path(pgdm.library.__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _filled_home(checkout: Path) -> Path:
+    """Return a ``PGDM_HOME`` whose library holds the checkout, made once per its content."""
+    home = CACHE / f"home-{_digest(checkout)}"
+    if not home.is_dir():
+        CACHE.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(dir=CACHE, prefix="filling-"))
+        pgdm.library.import_tcdm(checkout, fresh / "library")
+        try:
+            fresh.rename(home)
+        except OSError:  # another worker was first
+            shutil.rmtree(fresh)
+    return home
+
+
+@pytest.fixture(scope="session")
+def library_home() -> Path:
+    """Return a ``PGDM_HOME`` with all tasks of the checkout, and have ``PGDM_HOME`` name it.
+
+    Shared by all tests: copy it before changing anything.
+    """
+    if CHECKOUT is None:
+        pytest.skip("needs a TCDM checkout: name one with PGDM_TCDM_ROOT")
+    return _filled_home(CHECKOUT)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Before a test's fixtures: ``PGDM_HOME`` is the filled one if it asks, else a missing one.
+
+    A hook and not a fixture, so that it comes before fixtures of wider scope as well.
+    """
+    wants_library = "library_home" in getattr(item, "fixturenames", ())
+    if CHECKOUT is not None and wants_library:
+        os.environ["PGDM_HOME"] = str(_filled_home(CHECKOUT))
+    else:
+        shutil.rmtree(MISSING, ignore_errors=True)
+        os.environ["PGDM_HOME"] = str(MISSING)
+    os.environ.pop("MLFLOW_TRACKING_URI", None)
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the test in a folder of its own, as ``runs/`` goes below the working directory."""
+    monkeypatch.chdir(tmp_path)
