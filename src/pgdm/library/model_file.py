@@ -104,18 +104,6 @@ def _number(token: str) -> str | None:
     return match.group() if match else None
 
 
-def inline_defaults(model: ET.Element, common: ET.Element) -> None:
-    """Put the assets and defaults of ``common`` at the front of a model that lacks them.
-
-    In the released environment a robot attached to the table scene inherited that scene's main
-    default class, so the models whose own file does not include it need it as well.
-    """
-    if any(d.get("class") == "object_contact" for d in model.iter("default")):
-        return
-    parts = [c for c in common if c.tag in ("asset", "default")]
-    model[:] = [*parts, *model]
-
-
 def write(model: ET.Element, path: Path, note: str) -> list[tuple[Path, Path]]:
     """Write a model with its files beside it, in ``meshes/`` and ``textures/``.
 

@@ -110,7 +110,6 @@ def _licence_of(origin: str) -> str:
 
 
 def _add_models(tree: Tree, builder: SourceBuilder, progress: Progress) -> None:
-    common = model_file.parse(tree.assets / "common.xml", builder.defects, tree.root)
     parts = [("scene", "table", tree.assets / "environments" / "table.xml")]
     parts += [("hands", h, tree.assets / "robots" / h / "base.xml") for h in names.HANDS]
     parts += [("objects", p.stem, p) for p in sorted((tree.assets / "objects").glob("*.xml"))]
@@ -122,7 +121,6 @@ def _add_models(tree: Tree, builder: SourceBuilder, progress: Progress) -> None:
         model = model_file.parse(file, builder.defects, tree.root)
         if kind == "hands":
             _add_actuators(model, file.parent / "actuators.xml", builder, tree)
-        model_file.inline_defaults(model, common)
         missing = model_file.missing_files(model)
         if missing:
             builder.left_out[f"{kind}/{name}"] = f"{_label(tree, Path(missing[0]))} is missing" + (

@@ -104,7 +104,7 @@ class SimBatch:
         index = self.scene.index
         quat = self._d["xquat"][rows][:, self._bodies]
         points = self._d["geom_xpos"][rows][:, index.point_geoms]
-        com = self._d["xipos"][rows][:, index.object_body]
+        com = self._d["xipos"][rows][:, index.object_body].copy()
         pos = np.concatenate((points, com[:, None]), axis=1)
         cvel = self._d["cvel"][rows][:, self._bodies]  # angular, linear at the tree's COM
         angular = cvel[..., :3]

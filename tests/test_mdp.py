@@ -1,0 +1,196 @@
+"""Terms, metrics, observations and actions against numbers worked by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pgdm import rotations
+from pgdm.errors import UnknownNameError
+from pgdm.mdp import rewards, terminations
+from pgdm.mdp.actions import ActionCfg, absolute, action_map, residual, wrist_path
+from pgdm.mdp.context import StepContext
+from pgdm.mdp.metrics import Episodes, MetricsCfg, episode_metrics
+from pgdm.mdp.observations import ObsCfg, layout, released
+from pgdm.motion.reference import ObjectReference
+from pgdm.sim.batch import SimState
+from pgdm.sim.scene import SceneIndex
+
+QUARTER_Z = [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+IDENTITY = [1.0, 0.0, 0.0, 0.0]
+
+
+def double(values: object) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def state(pos: list, quat: list) -> SimState:
+    n = len(pos)
+    return SimState(
+        qpos=double([[0.1, 0.2]] * n),
+        qvel=double([[0.3, 0.4]] * n),
+        point_pos=double([[[1.0, 2.0, 3.0]]] * n),
+        point_quat=double([[IDENTITY]] * n),
+        point_vel=double([[[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]] * n),
+        object_pos=double(pos),
+        object_quat=double(quat),
+        object_vel=double([[7.0, 8.0, 9.0, 10.0, 11.0, 12.0]] * n),
+    )
+
+
+def context(pos: list, quat: list, target: list, target_quat: list, t: int = 1) -> StepContext:
+    n = len(pos)
+    return StepContext(
+        state(pos, quat), torch.full((n,), t), 5, double(target), double(target_quat), double([0.1] * n)
+    )
+
+
+def test_tracking_reward_by_hand() -> None:
+    # e = 0.03 m and a quarter turn: exp(-50 (0.03 + 0.1 * 0.5)) = exp(-4).
+    c = context([[0.03, 0, 0.1]], [QUARTER_Z], [[0, 0, 0.1]], [IDENTITY])
+    assert rewards.tracking(c, 50.0, 0.1).item() == pytest.approx(math.exp(-4.0), rel=1e-9)
+
+
+def test_lift_needs_object_and_target() -> None:
+    up, down = [0.0, 0.0, 0.121], [0.0, 0.0, 0.119]
+    c = context([up, up, down], [IDENTITY] * 3, [up, down, up], [IDENTITY] * 3)
+    assert rewards.lift(c, 0.02).tolist() == [1.0, 0.0, 0.0]
+
+
+def test_object_is_lost_at_the_limit_exactly() -> None:
+    c = context([[0.25, 0, 0], [0.2499, 0, 0]], [IDENTITY] * 2, [[0.0, 0, 0]] * 2, [IDENTITY] * 2)
+    assert terminations.object_lost(c, 0.25).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(("t", "ended"), [(4, False), (5, True)])
+def test_motion_ends_at_its_last_pose(t: int, ended: bool) -> None:
+    c = context([[0.0, 0, 0]], [IDENTITY], [[0.0, 0, 0]], [IDENTITY], t)
+    assert terminations.motion_ended(c).item() is ended
+
+
+def reference(points: list, quats: list | None = None) -> ObjectReference:
+    return ObjectReference(double(points), double(quats or [IDENTITY] * len(points)))
+
+
+CFG = MetricsCfg(success_threshold_m=0.01, lift_height_m=0.02)
+
+
+def test_metrics_of_a_steady_two_millimetre_error() -> None:
+    # SPEC 1: over 85 steps the released error is 2e-3 sqrt(85) / 85 = 2.169e-4.
+    ref = reference([[0.0, 0.0, 0.0]] * 86)
+    pos = torch.zeros(1, 86, 3, dtype=torch.float64)
+    pos[..., 0] = 0.002
+    quat = double([[QUARTER_Z] * 86])
+    m = episode_metrics(Episodes(pos, quat, torch.tensor([85])), ref, CFG)
+    assert m["com_error"].item() == pytest.approx(0.002)
+    assert m["com_error_released"].item() == pytest.approx(2.169e-4, rel=1e-3)
+    assert m["ori_error"].item() == pytest.approx(math.pi / 2)
+    assert m["success"].item() == 1.0
+    assert math.isnan(m["lifted"].item())  # nothing to lift
+
+
+def test_early_end_keeps_the_last_pose_but_earns_no_lift() -> None:
+    # Targets at 0, 3, 3, 3 cm; the object goes up at step 1 and the episode ends at step 2.
+    ref = reference([[0.0, 0, 0], [0.0, 0, 0.03], [0.0, 0, 0.03], [0.0, 0, 0.03]])
+    pos = double([[[0.0, 0, 0], [0.0, 0, 0.025], [0.0, 0, 0.01], [9.0, 9, 9]]])
+    quat = double([[IDENTITY] * 4])
+    m = episode_metrics(Episodes(pos, quat, torch.tensor([2])), ref, CFG)
+    assert m["com_error"].item() == pytest.approx((0.005 + 0.02 + 0.02) / 3)
+    assert m["success"].item() == pytest.approx(1 / 3)
+    assert m["lifted"].item() == pytest.approx(1 / 3)
+    assert m["dropped"].item() == 1.0
+    assert m["length"].item() == 2.0
+
+
+def test_time_and_goals_of_the_observation() -> None:
+    ref = reference([[float(k), 0.0, 0.0] for k in range(4)])
+    index = tiny_index()
+    observe = released(index, ref)
+    obs = observe(state([[5.0, 6.0, 7.0]], [QUARTER_Z]), torch.tensor([2]))[0]
+    expected = [0.1, 0.2, 1, 2, 3, 5, 6, 7, *IDENTITY, *QUARTER_Z, 0.3, 0.4]
+    expected += [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]
+    expected += [*IDENTITY, 3.0, 0, 0] * 3  # 1, 5 and 10 steps ahead: all at the last pose
+    phase = [c * 2 / 4 for c in (1, 4, 6, 8)]
+    expected += [math.sin(p) for p in phase] + [math.cos(p) for p in phase]
+    np.testing.assert_allclose(obs.numpy(), expected, rtol=1e-6)
+
+
+def test_unknown_layout_and_kind_name_the_valid_ones() -> None:
+    ref = reference([[0.0, 0, 0]] * 2)
+    with pytest.raises(UnknownNameError, match="released"):
+        layout(ObsCfg("relesed"), tiny_index(), ref)
+    with pytest.raises(UnknownNameError, match="residual"):
+        action_map(ActionCfg("residul", 3, 0.25), tiny_index(), ref, torch.zeros(8))
+
+
+def tiny_index() -> SceneIndex:
+    """Six base joints and two fingers; the mount is turned a quarter about z."""
+    return SceneIndex(
+        point_geoms=np.array([0]),
+        point_bodies=np.array([0]),
+        object_body=1,
+        fingertips=np.array([0]),
+        num_actuators=8,
+        num_compensated=8,
+        num_base_joints=6,
+        ctrl_low=np.array([-1.0, -1, -1, -2, -2, -2, 0, 0]),
+        ctrl_high=np.array([1.0, 1, 1, 2, 2, 2, 1, 2]),
+        mount_pos=np.array([0.0, -0.5, 0.2]),
+        mount_quat=np.array(QUARTER_Z),
+        randomized_geom=None,
+    )
+
+
+def test_absolute_action_is_affine_and_clipped() -> None:
+    ref = reference([[0.0, 0, 0]] * 3)
+    amap = absolute(ActionCfg("absolute", 3, 0.25), tiny_index(), ref, torch.zeros(8).double())
+    ctrl = amap.act(torch.tensor([[0.5, 0, 0, 0, 0, 0, 0.5, 9.0]]), torch.tensor([0]))[0]
+    torch.testing.assert_close(ctrl, double([0.5, 0, 0, 0, 0, 0, 0.75, 2.0]))
+
+
+def test_warm_start_adds_a_fifth_to_the_second_joint_and_the_fingers() -> None:
+    ref = reference([[0.0, 0, 0]] * 3)
+    start = double([0.5, 0, 0, 1.0, 0, 0, 0.5, 1.9])
+    amap = absolute(ActionCfg("absolute", 3, 0.25), tiny_index(), ref, start)
+    torch.testing.assert_close(amap.warm_start, double([0.5, 0.2, 0, 0.5, 0, 0, 0.2, 1.0]))
+
+
+def test_wrist_follows_a_pure_shift() -> None:
+    # The mount is turned by 90 degrees about z: world x is its -y, world y its x.
+    ref = reference([[0.0, 0, 0], [0.1, 0.2, 0.3]])
+    path = wrist_path(tiny_index(), ref, torch.zeros(8).double())
+    torch.testing.assert_close(path[0], torch.zeros(6).double())
+    torch.testing.assert_close(path[1], double([0.2, -0.1, 0.3, 0, 0, 0]))
+
+
+def test_wrist_carries_the_hand_rigidly() -> None:
+    generator = torch.Generator().manual_seed(0)
+    quats = torch.randn(6, 4, generator=generator, dtype=torch.float64)
+    quats = torch.nn.functional.normalize(quats[:1] + 0.3 * quats, dim=-1)
+    ref = ObjectReference(torch.randn(6, 3, generator=generator, dtype=torch.float64), quats)
+    index, start = tiny_index(), double([0.1, -0.2, 0.3, 0.4, -0.5, 0.6, 0, 0])
+    path = wrist_path(index, ref, start)
+    torch.testing.assert_close(path[0], start[:6])
+    mount_quat = torch.from_numpy(index.mount_quat)
+    pos = torch.from_numpy(index.mount_pos) + rotations.rotate(mount_quat, path[:, :3])
+    quat = rotations.multiply(mount_quat, rotations.from_euler_xyz(path[:, 3:]))
+    inverse = rotations.conjugate(ref.quat)
+    seen_pos = rotations.rotate(inverse, pos - ref.pos)  # the hand, seen from the object
+    seen_quat = rotations.multiply(inverse, quat)
+    torch.testing.assert_close(seen_pos, seen_pos[:1].expand_as(seen_pos))
+    assert (rotations.angle(seen_quat, seen_quat[:1].expand_as(seen_quat)) < 1e-7).all()
+
+
+def test_residual_leads_by_three_steps_and_corrects_a_quarter() -> None:
+    ref = reference([[0.0, 0.01 * k, 0.0] for k in range(10)])
+    cfg = ActionCfg("residual", 3, 0.25)
+    amap = residual(cfg, tiny_index(), ref, torch.zeros(8).double())
+    action = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0, 0], [0.0] * 8])
+    ctrl = amap.act(action, torch.tensor([2, 8]))
+    # Step 2: target of step 5 (world y 0.05 = mount x), plus 0.25 * 1 * half-range 1.
+    assert ctrl[0, 0].item() == pytest.approx(0.05 + 0.25)
+    assert ctrl[1, 0].item() == pytest.approx(0.09)  # beyond the end: the last pose
+    assert amap.warm_start[:6].abs().max() == 0.0
