@@ -1,0 +1,1 @@
+"""Learning: collect, learn, evaluate, checkpoint; knows neither MuJoCo nor methods."""

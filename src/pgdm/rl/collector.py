@@ -1,0 +1,156 @@
+"""Acting in the environment and keeping what happened."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pgdm.errors import RunError
+from pgdm.rl.networks import ActorCritic
+from pgdm.rl.vec_env import VecEnv
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use ``count`` threads inside.
+
+    While simulations step, torch gets one: its helper threads keep a core spinning for about
+    4 ms after each call (libgomp), which the simulation's own threads need.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@dataclass
+class Rollout:
+    """T steps of N simulations. The tensors are reused by the next iteration."""
+
+    obs: Tensor
+    """(T + 1, N, D) observations as the environment gave them; the last are those to go on from."""
+    action: Tensor
+    """(T, N, A) actions as sampled."""
+    log_prob: Tensor
+    """(T, N) their log-probabilities."""
+    reward: Tensor
+    """(T, N) rewards."""
+    terminated: Tensor
+    """(T, N) bool, nothing came after."""
+    truncated: Tensor
+    """(T, N) bool, the episode was cut."""
+    last_obs: list[tuple[int, Tensor, Tensor]] = field(default_factory=list)
+    """Of each step with truncated rows: t, the rows (k,), their true last observations (k, D)."""
+    episodes: dict[str, list[Tensor]] = field(default_factory=dict)
+    """Metrics of the episodes that finished, one tensor (k,) a step."""
+
+    @classmethod
+    def empty(cls, steps: int, env: VecEnv) -> Rollout:
+        """Return room for ``steps`` steps of an environment."""
+        n = env.num_envs
+        return cls(
+            obs=torch.zeros(steps + 1, n, env.obs_dim),
+            action=torch.zeros(steps, n, env.action_dim),
+            log_prob=torch.zeros(steps, n),
+            reward=torch.zeros(steps, n),
+            terminated=torch.zeros(steps, n, dtype=torch.bool),
+            truncated=torch.zeros(steps, n, dtype=torch.bool),
+        )
+
+    def metrics(self) -> dict[str, float]:
+        """Return the mean reward of a step, and the means over the finished episodes, if any."""
+        means = {name: float(torch.cat(v).double().mean()) for name, v in self.episodes.items()}
+        finished = sum(len(v) for v in next(iter(self.episodes.values()), []))
+        return {"reward": float(self.reward.mean()), "episodes": float(finished), **means}
+
+
+class Collector:
+    """Steps the environment with the policy and fills one rollout after the other.
+
+    Args:
+        env: the environment.
+        model: the policy that acts.
+        steps: T, steps of each simulation in a rollout.
+        generator: stream of the action noise.
+    """
+
+    def __init__(
+        self, env: VecEnv, model: ActorCritic, steps: int, generator: torch.Generator
+    ) -> None:
+        self.env, self.model = env, model
+        self.steps, self.generator = steps, generator
+        self._rollout = Rollout.empty(steps, env)
+
+    @property
+    def frames(self) -> int:
+        """Environment steps in one rollout."""
+        return self.steps * self.env.num_envs
+
+    def reset(self) -> None:
+        """Start all simulations afresh."""
+        self._rollout.obs[-1] = self.env.reset()
+
+    def collect(self) -> Rollout:
+        """Go on from where the last rollout ended, for ``steps`` steps.
+
+        Raises:
+            RunError: if the environment gives a reward or an observation that is not finite.
+        """
+        rollout = self._rollout
+        rollout.obs[0] = rollout.obs[-1].clone()
+        rollout.last_obs, rollout.episodes = [], {}
+        with torch_threads(1), torch.no_grad():
+            for t in range(self.steps):
+                self._step(rollout, t)
+        return rollout
+
+    def _step(self, rollout: Rollout, t: int) -> None:
+        action, log_prob = self.model.sample(rollout.obs[t], self.generator)
+        rollout.action[t], rollout.log_prob[t] = action, log_prob
+        obs, reward, terminated, truncated, info = self.env.step(rollout.action[t])
+        rollout.obs[t + 1], rollout.reward[t] = obs, reward
+        rollout.terminated[t], rollout.truncated[t] = terminated, truncated
+        # A sum is finite only if all its parts are, and costs a tenth of looking at each.
+        if not math.isfinite(float(reward.sum()) + float(obs.sum())):
+            _check_finite(t, obs, reward, info)
+        if truncated.any():
+            rows = truncated.nonzero()[:, 0]
+            rollout.last_obs.append((t, rows, info["final_obs"][rows].clone()))
+        for name, values in info["episodes"].items():
+            rollout.episodes.setdefault(name, []).append(values)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the next rollout depends on, the policy aside."""
+        return {
+            "env": self.env.state_dict(),
+            "obs": self._rollout.obs[-1].clone(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``."""
+        self.env.load_state_dict(state["env"])
+        self._rollout.obs[-1] = state["obs"]
+        self.generator.set_state(state["generator"])
+
+
+def _check_finite(t: int, obs: Tensor, reward: Tensor, info: dict[str, Any]) -> None:
+    """Raise an error that names the first bad number."""
+    terms = {f"reward term '{name}'": value for name, value in info.get("terms", {}).items()}
+    for name, values in {**terms, "the reward": reward, "the observation": obs}.items():
+        bad = (~torch.isfinite(values)).nonzero()
+        if len(bad):
+            row, *entry = bad[0].tolist()
+            which = f"entry {entry[0]} of " if entry else ""
+            raise RunError(
+                f"{which}{name} is {float(values[tuple(bad[0])])} in simulation {row} at step {t} "
+                "of the iteration; nothing was learned from it, the last checkpoint is good"
+            )

@@ -1,0 +1,207 @@
+"""Proximal policy optimisation: from a rollout to better networks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pgdm.errors import ConfigError, RunError
+from pgdm.rl.collector import Rollout, torch_threads
+from pgdm.rl.loss import LossTerms, Minibatch, advantages, ppo_loss
+from pgdm.rl.networks import ActorCritic
+
+
+@dataclass(frozen=True)
+class PPOCfg:
+    """Settings of PPO; the paper's are in ``conf/algo/ppo.yaml``."""
+
+    name: str
+    """Name of the settings, as reports show it."""
+    gamma: float
+    """Discount per control step, 0..1."""
+    gae_lambda: float
+    """Lambda of generalised advantage estimation, 0..1."""
+    learning_rate: float
+    """Step size of Adam."""
+    adam_eps: float
+    """Epsilon of Adam."""
+    value_coef: float
+    """Weight of the value loss."""
+    entropy_coef: float
+    """Weight of the entropy bonus."""
+    clip: float
+    """Clip range of the probability ratio."""
+    steps_per_env: int
+    """T, control steps of each simulation between two updates."""
+    minibatch_size: int
+    """M, samples in one gradient step; divides num_envs * steps_per_env."""
+    epochs: int
+    """Passes over the collected samples."""
+    normalize_advantage: bool
+    """Whether advantages are standardised within each minibatch."""
+    max_grad_norm: float
+    """Gradients are scaled down to this norm."""
+    hidden: list[int]
+    """Widths of the hidden tanh layers of policy and value network, each."""
+    log_std_init: float
+    """Log of the policy's standard deviation at the start."""
+    warm_start: bool
+    """Whether the policy's mean starts at the environment's ``warm_start()``."""
+    normalize_observations: bool
+    """Whether observations are standardised by their running mean and variance."""
+    observation_clip: float
+    """Standardised observations are clipped here, standard deviations."""
+
+
+class Learner:
+    """Holds the optimiser and takes the gradient steps.
+
+    Args:
+        model: policy and value function, changed in place.
+        cfg: settings of PPO.
+        generator: stream of the order in which samples are visited.
+        num_threads: threads of torch while learning.
+    """
+
+    def __init__(
+        self, model: ActorCritic, cfg: PPOCfg, generator: torch.Generator, num_threads: int
+    ) -> None:
+        self.model, self.cfg = model, cfg
+        self._generator, self._num_threads = generator, num_threads
+        self._params = list(model.parameters())
+        self._optimizer = torch.optim.Adam(
+            self._params, lr=cfg.learning_rate, eps=cfg.adam_eps, fused=True
+        )
+
+    def learn(self, rollout: Rollout) -> dict[str, float]:
+        """Take ``epochs`` passes over a rollout; return what is logged.
+
+        The statistics of the observations are brought up to date last: all of an iteration,
+        acting and learning, sees the same ones.
+
+        Raises:
+            RunError: if a loss or gradient is not finite; that step is then not taken.
+        """
+        with torch_threads(self._num_threads):
+            batch, metrics = self._prepare(rollout)
+            steps = [
+                self._update(Minibatch(*(column[rows] for column in batch)))
+                for _ in range(self.cfg.epochs)
+                for rows in self._minibatches(len(batch.obs))
+            ]
+            if self.model.normalizer is not None:
+                self.model.normalizer.update(rollout.obs[:-1].flatten(0, 1).to(self.model.device))
+        means = torch.stack(steps).mean(0).tolist()
+        return {**metrics, **dict(zip(_LOGGED, means, strict=True)), **self._policy_metrics()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return networks, optimiser and the state of the visiting order's stream."""
+        return {
+            "model": {name: value.clone() for name, value in self.model.state_dict().items()},
+            "optimizer": self._optimizer.state_dict(),
+            "generator": self._generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``."""
+        self.model.load_state_dict(state["model"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._generator.set_state(state["generator"])
+
+    def _prepare(self, rollout: Rollout) -> tuple[Minibatch, dict[str, float]]:
+        """Return all T * N samples with their advantages, and the value function's quality."""
+        cfg, device = self.cfg, self.model.device
+        with torch.no_grad():
+            obs = self.model.normalize(rollout.obs.to(device))  # (T + 1, N, D)
+            values = self.model.value(obs).cpu()  # (T + 1, N), once an iteration as in R
+            next_values = values[1:].clone()
+            for t, rows, last in rollout.last_obs:
+                next_values[t, rows] = self.model.value(self.model.normalize(last.to(device))).cpu()
+            advantage, target = advantages(
+                values[:-1],
+                next_values,
+                rollout.reward,
+                rollout.terminated,
+                rollout.truncated,
+                gamma=cfg.gamma,
+                gae_lambda=cfg.gae_lambda,
+            )
+        columns = (rollout.action, rollout.log_prob, advantage, target)
+        batch = Minibatch(
+            obs[:-1].flatten(0, 1), *(column.flatten(0, 1).to(device) for column in columns)
+        )
+        return batch, {"explained_variance": explained_variance(values[:-1], target)}
+
+    def _minibatches(self, count: int) -> tuple[Tensor, ...]:
+        order = torch.randperm(count, generator=self._generator).to(self.model.device)
+        return order.split(self.cfg.minibatch_size)
+
+    def _update(self, batch: Minibatch) -> Tensor:
+        """Take one gradient step; return the numbers of ``_LOGGED``."""
+        cfg, model = self.cfg, self.model
+        terms = ppo_loss(
+            model.mean(batch.obs),
+            model.log_std,
+            model.value(batch.obs),
+            batch,
+            clip=cfg.clip,
+            value_coef=cfg.value_coef,
+            entropy_coef=cfg.entropy_coef,
+            normalize_advantage=cfg.normalize_advantage,
+        )
+        self._optimizer.zero_grad()
+        terms.total.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self._params, cfg.max_grad_norm)
+        if not math.isfinite(float(terms.total.detach() + norm)):
+            raise RunError(_not_finite(terms, norm))
+        self._optimizer.step()
+        return torch.stack([term.detach() for term in terms[1:]] + [norm])
+
+    def _policy_metrics(self) -> dict[str, float]:
+        std = float(self.model.log_std.detach().exp().mean())
+        return {"action_std": std, "lr": float(self._optimizer.param_groups[0]["lr"])}
+
+
+_LOGGED = (
+    *("loss_policy", "loss_value", "entropy", "kl", "clip_fraction", "ess"),
+    "grad_norm",
+)
+"""Means over the gradient steps of an iteration, in the order of ``LossTerms``."""
+
+
+def check_batch(cfg: PPOCfg, num_envs: int) -> None:
+    """Check that the minibatches come out even.
+
+    Raises:
+        ConfigError: with the sizes, if they do not.
+    """
+    samples = num_envs * cfg.steps_per_env
+    if samples % cfg.minibatch_size:
+        raise ConfigError(
+            f"minibatch_size {cfg.minibatch_size} does not divide the {samples} samples of an "
+            f"iteration (num_envs {num_envs} * steps_per_env {cfg.steps_per_env})"
+        )
+
+
+def explained_variance(values: Tensor, target: Tensor) -> float:
+    """Return 1 - var(target - values) / var(target), 1 at best; NaN if the target is constant."""
+    spread = float(target.var(correction=0))
+    if spread == 0:
+        return math.nan
+    return 1 - float((target - values).var(correction=0)) / spread
+
+
+def _not_finite(terms: LossTerms, norm: Tensor) -> str:
+    names = ("loss_policy", "loss_value", "entropy")
+    values = {name: float(term) for name, term in zip(names, terms[1:4], strict=True)}
+    values["grad_norm"] = float(norm)
+    bad = next((name for name, value in values.items() if not math.isfinite(value)), "loss")
+    shown = ", ".join(f"{name} {value:g}" for name, value in values.items())
+    return (
+        f"{bad} is not finite ({shown}); the step was not taken, the last checkpoint is good: "
+        "try a lower algo.learning_rate"
+    )

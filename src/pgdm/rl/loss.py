@@ -1,0 +1,137 @@
+"""Advantages and the clipped loss of PPO.
+
+The loss is written out here and not taken from TorchRL: its ``ClipPPOLoss`` adds 1.1 to 1.5 ms to
+each gradient step of 3.3 ms (80 an iteration), which is a twentieth of the whole training's speed.
+The tests hold this one equal to it and to stable-baselines3's.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pgdm.rl.networks import gaussian_entropy, gaussian_log_prob
+
+_ADVANTAGE_EPS = 1e-8
+
+
+class Minibatch(NamedTuple):
+    """M samples of an iteration, in random order."""
+
+    obs: Tensor
+    """(M, D) normalised observations."""
+    action: Tensor
+    """(M, A) actions as sampled, before the environment clipped them."""
+    log_prob: Tensor
+    """(M,) log-probability of the action when it was taken."""
+    advantage: Tensor
+    """(M,) how much better than expected it went."""
+    target: Tensor
+    """(M,) what the value function should have said."""
+
+
+class LossTerms(NamedTuple):
+    """The loss of one minibatch and what is logged beside it; all ()."""
+
+    total: Tensor
+    """What is minimised."""
+    policy: Tensor
+    """Clipped surrogate, unweighted."""
+    value: Tensor
+    """Mean squared error of the value function, unweighted."""
+    entropy: Tensor
+    """Entropy of the policy, nat."""
+    kl: Tensor
+    """Approximate divergence from the policy that acted, mean of (r - 1) - log r, nat."""
+    clip_fraction: Tensor
+    """Share of the samples whose probability ratio r lies outside the clip range."""
+    ess: Tensor
+    """Effective sample size under the ratios, as a share of M."""
+
+
+def ppo_loss(
+    mean: Tensor,
+    log_std: Tensor,
+    value: Tensor,
+    batch: Minibatch,
+    *,
+    clip: float,
+    value_coef: float,
+    entropy_coef: float,
+    normalize_advantage: bool,
+) -> LossTerms:
+    """Return the clipped loss (Schulman et al. 2017) as stable-baselines3 computes it.
+
+    Args:
+        mean: the policy's means now, (M, A).
+        log_std: log of its standard deviations, (A,).
+        value: the value function now, (M,).
+        batch: the samples.
+        clip: the probability ratio counts only within 1 - clip .. 1 + clip.
+        value_coef: weight of the value loss.
+        entropy_coef: weight of the entropy bonus.
+        normalize_advantage: standardise the advantages within the minibatch.
+    """
+    advantage = batch.advantage
+    if normalize_advantage and len(advantage) > 1:
+        advantage = (advantage - advantage.mean()) / (advantage.std() + _ADVANTAGE_EPS)
+    log_ratio = gaussian_log_prob(mean, log_std, batch.action) - batch.log_prob
+    ratio = log_ratio.exp()
+    clipped = ratio.clamp(1 - clip, 1 + clip)
+    policy = -torch.minimum(ratio * advantage, clipped * advantage).mean()
+    error = torch.nn.functional.mse_loss(value, batch.target)
+    entropy = gaussian_entropy(log_std)
+    total = policy + value_coef * error - entropy_coef * entropy
+    with torch.no_grad():
+        kl = (ratio - 1 - log_ratio).mean()
+        outside = (ratio != clipped).float().mean()
+        ess = ratio.sum().square() / (ratio.square().sum() * len(ratio))
+    return LossTerms(total, policy, error, entropy, kl, outside, ess)
+
+
+def advantages(
+    values: Tensor,
+    next_values: Tensor,
+    reward: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    *,
+    gamma: float,
+    gae_lambda: float,
+) -> tuple[Tensor, Tensor]:
+    """Return advantages and value targets, each (T, N), by TorchRL's generalised estimator.
+
+    Args:
+        values: value of the observation acted upon, (T, N).
+        next_values: value of the observation that followed, (T, N); of a truncated row that of
+            the true last observation. Not used where terminated.
+        reward: (T, N).
+        terminated: nothing came after, (T, N) bool.
+        truncated: the episode was cut there, (T, N) bool.
+        gamma: discount per step.
+        gae_lambda: decay of the longer estimates.
+    """
+    with warnings.catch_warnings():
+        # Imported here, and quietly, because it costs 2 s, and warns that its compiled part (which
+        # nothing here uses) was built for another torch.
+        warnings.simplefilter("ignore")
+        from torchrl.objectives.value.functional import generalized_advantage_estimate
+
+    def layout(x: Tensor) -> Tensor:  # (T, N) -> (N, T, 1)
+        return x.t().unsqueeze(-1)
+
+    # A value that is not finite would survive the multiplication with 0 that switches it off.
+    following = next_values.masked_fill(terminated, 0.0)
+    advantage, target = generalized_advantage_estimate(
+        gamma,
+        gae_lambda,
+        layout(values),
+        layout(following),
+        layout(reward),
+        layout(terminated | truncated),
+        layout(terminated),
+    )
+    return advantage.squeeze(-1).t(), target.squeeze(-1).t()

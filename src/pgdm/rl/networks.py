@@ -1,0 +1,157 @@
+"""The policy and the value function, two separate networks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pgdm.errors import RunError
+from pgdm.rl.normalizer import Normalizer
+
+# Gains of stable-baselines3, which trained the paper's policies.
+_HIDDEN_GAIN, _MEAN_GAIN, _VALUE_GAIN = math.sqrt(2), 0.01, 1.0
+_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+@dataclass(frozen=True)
+class NetworkCfg:
+    """What is needed to build the networks that a checkpoint's weights fit into."""
+
+    obs_dim: int
+    """D, numbers in an observation."""
+    action_dim: int
+    """A, numbers in an action."""
+    hidden: list[int]
+    """Widths of the hidden layers, of each of the two networks."""
+    log_std_init: float
+    """Log of the policy's standard deviation at the start."""
+    normalize_observations: bool
+    """Whether observations are standardised by their running statistics."""
+    observation_clip: float
+    """Standardised observations are clipped here, standard deviations."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings as plain values."""
+        return asdict(self)
+
+
+def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
+    """Return the log-density (M,) of actions (M, A) under N(mean (M, A), exp(log_std (A,)))."""
+    z = (action - mean) * torch.exp(-log_std)
+    return -0.5 * z.square().sum(-1) - log_std.sum() - log_std.numel() * _LOG_SQRT_2PI
+
+
+def gaussian_entropy(log_std: Tensor) -> Tensor:
+    """Return the entropy () of a Gaussian with independent entries, log_std (A,)."""
+    return log_std.sum() + log_std.numel() * (0.5 + _LOG_SQRT_2PI)
+
+
+class ActorCritic(nn.Module):
+    """A Gaussian policy with a free standard deviation, and a value function.
+
+    Actions are neither squashed nor clipped: the environment clips, and the log-probability is
+    that of the action before (as stable-baselines3 does).
+
+    Args:
+        cfg: sizes and start values.
+        generator: stream of the orthogonal initial weights; None leaves them uninitialised, for
+            weights that are loaded afterwards.
+        mean_bias: start (A,) of the policy's mean, or None for 0.
+    """
+
+    def __init__(
+        self,
+        cfg: NetworkCfg,
+        generator: torch.Generator | None = None,
+        mean_bias: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.cfg = cfg
+        self.normalizer = (
+            Normalizer(cfg.obs_dim, cfg.observation_clip) if cfg.normalize_observations else None
+        )
+        self.policy = _mlp(cfg.obs_dim, cfg.hidden, cfg.action_dim)
+        self.critic = _mlp(cfg.obs_dim, cfg.hidden, 1)
+        self.log_std = nn.Parameter(torch.full((cfg.action_dim,), float(cfg.log_std_init)))
+        if generator is not None:
+            _initialise(self.policy, _MEAN_GAIN, generator)
+            _initialise(self.critic, _VALUE_GAIN, generator)
+        if mean_bias is not None:
+            with torch.no_grad():
+                self.policy[-1].bias.copy_(mean_bias)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.log_std.device
+
+    def normalize(self, obs: Tensor) -> Tensor:
+        """Return observations (..., D) as the networks want them."""
+        return obs if self.normalizer is None else self.normalizer(obs)
+
+    def mean(self, normalized: Tensor) -> Tensor:
+        """Return the policy's mean (M, A) at normalised observations (M, D)."""
+        return self.policy(normalized)
+
+    def value(self, normalized: Tensor) -> Tensor:
+        """Return the discounted return (M,) expected from normalised observations (M, D)."""
+        return self.critic(normalized).squeeze(-1)
+
+    @torch.no_grad()
+    def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw actions (N, A) and their log-probabilities (N,) at raw observations (N, D).
+
+        The noise is drawn on the generator's device, so that a run with its networks elsewhere
+        draws the same.
+        """
+        mean = self.mean(self.normalize(obs.to(self.device)))
+        noise = torch.randn(mean.shape, generator=generator).to(self.device)
+        action = mean + self.log_std.exp() * noise
+        return action, gaussian_log_prob(mean, self.log_std, action)
+
+    @torch.no_grad()
+    def act(
+        self, obs: Tensor, generator: torch.Generator | None = None, deterministic: bool = False
+    ) -> Tensor:
+        """Return actions (N, A) on the CPU for raw observations (N, D).
+
+        Args:
+            obs: observations as the environment gives them.
+            generator: stream of the noise; needed unless deterministic.
+            deterministic: the policy's mean instead of a sample.
+
+        Raises:
+            RunError: if a sample is wanted without a generator.
+        """
+        if deterministic:
+            return self.mean(self.normalize(obs.to(self.device))).cpu()
+        if generator is None:
+            raise RunError("sampling an action needs a generator; pass one or deterministic=True")
+        return self.sample(obs, generator)[0].cpu()
+
+
+def _mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [_linear(inputs, width), nn.Tanh()]
+        inputs = width
+    return nn.Sequential(*layers, _linear(inputs, outputs))
+
+
+def _linear(inputs: int, outputs: int) -> nn.Linear:
+    # skip_init: torch's own start values would draw from the global stream.
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
+    return layer  # pyright: ignore[reportReturnType]
+
+
+def _initialise(net: nn.Sequential, last_gain: float, generator: torch.Generator) -> None:
+    layers = [layer for layer in net if isinstance(layer, nn.Linear)]
+    for layer in layers:
+        gain = last_gain if layer is layers[-1] else _HIDDEN_GAIN
+        nn.init.orthogonal_(layer.weight, gain, generator=generator)
+        nn.init.zeros_(layer.bias)

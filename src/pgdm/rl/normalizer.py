@@ -1,0 +1,52 @@
+"""Running mean and variance of observations."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+_EPS = 1e-8
+"""Added to the variance, as stable-baselines3 does, so that constant entries become 0."""
+
+
+class Normalizer(nn.Module):
+    """Standardises observations by the mean and variance of all that it was shown.
+
+    Before the first ``update`` it only clips. Statistics change in ``update`` alone: the learner
+    calls it after the gradient steps of an iteration, so that the policy that acts and the policy
+    that learns see the same numbers.
+
+    Args:
+        size: D, numbers in an observation.
+        clip: results are clipped to this many standard deviations.
+    """
+
+    count: Tensor
+    mean: Tensor
+    var: Tensor
+
+    def __init__(self, size: int, clip: float) -> None:
+        super().__init__()
+        self.clip = clip
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("var", torch.ones(size, dtype=torch.float64))
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """Return observations (..., D) standardised and clipped, float32."""
+        scale = (self.var + _EPS).rsqrt().float()
+        return ((obs - self.mean.float()) * scale).clamp(-self.clip, self.clip)
+
+    @torch.no_grad()
+    def update(self, obs: Tensor) -> None:
+        """Take in observations (M, D): the parallel form of Welford's update (Chan et al. 1979)."""
+        samples = obs.double()
+        var, mean = torch.var_mean(samples, dim=0, correction=0)
+        total = self.count + len(obs)
+        delta = mean - self.mean
+        share = len(obs) / total
+        # With count 0 the starting values of mean and var carry no weight.
+        spread = delta.square() * (share * (1 - share))
+        self.var.copy_(self.var * (1 - share) + var * share + spread)
+        self.mean.add_(delta * share)
+        self.count.copy_(total)
