@@ -16,9 +16,7 @@ from pgdm.errors import ConfigError, RunError
 FILE = "config.yaml"
 FORMAT = 1
 
-_HEADER = (
-    "# All settings of this run, as it was started. pgdm-run reads them when the run goes on.\n"
-)
+_HEADER = "# All settings of this run. pgdm-run compares them when the run goes on.\n"
 
 
 def save_config(cfg: ExperimentCfg, run_dir: str | os.PathLike[str]) -> Path:

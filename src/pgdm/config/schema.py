@@ -13,7 +13,7 @@ from pgdm.methods import METHODS, MethodCfg
 from pgdm.pregrasp.sources import SOURCES, PregraspCfg
 from pgdm.rl.checkpoint import CheckpointCfg
 from pgdm.rl.evaluate import EvalCfg
-from pgdm.rl.trainer import PPOCfg
+from pgdm.rl.learner import PPOCfg
 from pgdm.sim.scene import HandCfg, SimCfg, TaskCfg
 from pgdm.tracking.tracker import TrackingCfg
 
@@ -111,8 +111,9 @@ class ExperimentCfg:
             )
         if self.action.kind == "residual" and hand.num_base_joints != 6:
             raise ConfigError(
-                f"action.kind=residual carries the wrist on 6 base joints, but hand "
-                f"'{hand.name}' has hand.num_base_joints {hand.num_base_joints}; use action=absolute"
+                f"action.kind=residual carries the wrist on 6 base joints, but "
+                f"hand '{hand.name}' has hand.num_base_joints {hand.num_base_joints}; "
+                f"use action=absolute"
             )
 
     def _check_placements(self) -> None:

@@ -16,7 +16,7 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import YAMLError
 
 from pgdm.config.groups import available, conf_dir, groups
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = [
     "COMPOSITION_ERRORS",
     "available",
+    "check_overrides",
     "compose",
     "conf_dir",
     "explain",
@@ -96,12 +97,31 @@ def _typed(overrides: tuple[str, ...], folder: str | None, _stamp: int) -> Exper
 
 
 def _composed(overrides: Sequence[str], folder: str | None = None) -> DictConfig:
+    check_overrides(overrides)
     search = [] if folder is None else [f"hydra.searchpath=[{_quoted(f'file://{folder}')}]"]
     try:
         with _LOCK, _own_hydra(), hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
             return hydra.compose("config", overrides=[*search, *overrides])
     except COMPOSITION_ERRORS as error:
-        raise explain(error) from error
+        raise explain(error, overrides) from error
+
+
+def check_overrides(overrides: Sequence[str]) -> None:
+    """Refuse what Hydra would take without a word, or answer without a name.
+
+    Raises:
+        ConfigError: if an override has no key, or gives a group several options.
+    """
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if not key.strip("+~"):
+            raise ConfigError(f"cannot read '{override}'; write key=value, such as seed=3")
+        if value.startswith("[") and key in groups():
+            # Hydra would merge the options, so that the last one wins.
+            raise ConfigError(
+                f"{key} takes one option, not the list {value}; to run one after the other: "
+                f"-m {key}={value.strip('[]')}"
+            )
 
 
 @contextmanager
@@ -120,13 +140,17 @@ def _quoted(text: str) -> str:
     return f"'{escaped}'"
 
 
-def explain(error: Exception) -> ConfigError:
+def explain(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
     """Return what an error of COMPOSITION_ERRORS means for a user, as one line.
 
     Args:
         error: what Hydra, OmegaConf or the YAML reader raised.
+        overrides: what the user gave.
     """
     text = " ".join(str(error).split())
+    if isinstance(error, MissingMandatoryValue):
+        key = error.full_key
+        return ConfigError(f"{key} has no value yet (???); give one, such as {key}=...")
     for tail in (" full_key:", " Config search path:", " object_type="):
         text = text.partition(tail)[0]
     if isinstance(error, MissingConfigException):
@@ -135,7 +159,9 @@ def explain(error: Exception) -> ConfigError:
         return ConfigError(f"cannot read '{error.override}'; write key=value, such as seed=3")
     if isinstance(error, YAMLError):
         return ConfigError(f"a settings file is not valid YAML: {text}")
-    return _explain_text(text)
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        return _explain_text(text)
+    return ConfigError(f"cannot apply {' '.join(overrides)}: {text}")
 
 
 def _explain_text(text: str) -> ConfigError:

@@ -50,7 +50,7 @@ def build(cls: type[T], data: object, path: str = "") -> T:
     return cls(**{name: _value(hints[name], data[name], _join(path, name)) for name in names})
 
 
-def _value(hint: Any, value: object, path: str) -> Any:  # noqa: ANN401 (any type of a field)
+def _value(hint: Any, value: object, path: str) -> Any:
     origin = typing.get_origin(hint)
     if origin in (types.UnionType, typing.Union):
         inner = [option for option in typing.get_args(hint) if option is not type(None)]
@@ -68,20 +68,20 @@ def _value(hint: Any, value: object, path: str) -> Any:  # noqa: ANN401 (any typ
 
 
 def _scalar(kind: type, value: object, path: str) -> bool | int | float | str:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if kind is float and is_number:
-        if not math.isfinite(value):
+    if kind in (int, float) and isinstance(value, int | float) and not isinstance(value, bool):
+        if kind is float and not math.isfinite(value):
             raise ConfigError(f"{path}: {value} is not a finite number")
-        return float(value)
-    if kind is int and is_number and float(value).is_integer():
-        return int(value)
-    if kind in (bool, str) and isinstance(value, kind):
+        if kind is float:
+            return float(value)
+        if isinstance(value, int) or value.is_integer():
+            return int(value)
+    elif kind in (bool, str) and isinstance(value, bool | str) and type(value) is kind:
         return value
     hint = f"; write {path}=\"'{value}'\" to mean text" if kind is str else ""
     raise ConfigError(f"{path}: {_show(value)} is not {_name(kind)}{hint}")
 
 
-def _name(hint: Any) -> str:  # noqa: ANN401 (any type of a field)
+def _name(hint: Any) -> str:
     if typing.get_origin(hint) is list:
         return "a list"
     return _KIND.get(hint, "a set of keys")

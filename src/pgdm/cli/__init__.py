@@ -1,0 +1,1 @@
+"""What people type: ``pgdm-run`` and ``pgdm``."""

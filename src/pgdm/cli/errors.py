@@ -1,0 +1,98 @@
+"""Errors as people see them: one line that names the wrong value and the cure, and an exit code."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
+
+from pgdm.errors import ConfigError, PgdmError
+
+USAGE = 2
+"""Exit code: a setting, an option or a name is wrong."""
+FAILED = 1
+"""Exit code: the command was right, and failed."""
+INTERRUPTED = 130
+"""Exit code: stopped from outside (128 + SIGINT); SIGTERM gives 143."""
+
+EXPECTED = (PgdmError, OSError, MemoryError, KeyboardInterrupt)
+"""Errors that no program can rule out."""
+
+_CURES = {
+    errno.ENOSPC: "the disk is full; make room and start the same command again",
+    errno.EDQUOT: "the disk quota is used up; make room and start the same command again",
+    errno.EFBIG: "the file has reached the size limit of this account; raise it (ulimit -f)",
+    errno.EROFS: "it is on a read-only file system; choose another folder (run_dir=..., PGDM_HOME)",
+    errno.EACCES: "permission is missing; change it, or choose another folder (run_dir=...)",
+    errno.EPERM: "permission is missing; change it, or choose another folder (run_dir=...)",
+    errno.ENOTDIR: "a file stands where a folder is needed; choose another folder",
+    errno.EEXIST: "a file stands where a folder is needed; choose another folder",
+    errno.EISDIR: "a folder stands where a file is needed; choose another name",
+    errno.ENOENT: "there is no such file or folder; check the path",
+    errno.EMFILE: "too many files are open; raise the limit (ulimit -n)",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+}
+
+
+def message(error: BaseException) -> str:
+    """Return what a user should read, on one line."""
+    if isinstance(error, PgdmError):
+        text = str(error)
+    elif isinstance(error, KeyboardInterrupt):
+        text = "interrupted; the same command goes on from the last checkpoint"
+    elif isinstance(error, MemoryError):
+        text = "out of memory; use fewer simulations (num_envs=...) or a smaller algo.hidden"
+    elif isinstance(error, OSError):
+        text = _os_message(error)
+    else:
+        name = type(error).__name__
+        text = f"{name}: {error} (a defect of pgdm: please report it with what --debug shows)"
+    return " ".join(text.split())
+
+
+def _os_message(error: OSError) -> str:
+    name = f"'{error.filename}': " if error.filename else ""
+    cure = _CURES.get(error.errno or 0)
+    if cure is None:
+        return f"{name}{error.strerror or error}"
+    return f"{name}{cure}"
+
+
+def exit_code(error: BaseException) -> int:
+    """Return the exit code that tells what kind of error it was."""
+    if isinstance(error, ConfigError):
+        return USAGE
+    return INTERRUPTED if isinstance(error, KeyboardInterrupt) else FAILED
+
+
+def report(error: BaseException, debug: bool) -> int:
+    """Print an error to stderr, its traceback only for ``debug``, and return the exit code."""
+    if debug:
+        traceback.print_exception(error)
+    try:
+        print(f"error: {message(error)}", file=sys.stderr, flush=True)
+    except OSError:
+        # Nobody reads stderr any more (closed pipe, full disk): the exit code has to do.
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115 (open until the process ends)
+    return exit_code(error)
+
+
+@contextmanager
+def one_line(debug: bool) -> Iterator[None]:
+    """Show also an error that nobody expected as one line, while inside.
+
+    It uses the interpreter's hook, and catches nothing: what goes wrong still ends the process.
+    """
+
+    def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        del kind, trace
+        report(error, debug)
+
+    before, sys.excepthook = sys.excepthook, hook
+    yield
+    # Reached only if all went well: on an error the hook must outlive this function.
+    sys.excepthook = before

@@ -1,0 +1,89 @@
+"""The flags of ``pgdm-run``, read before Hydra sees the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from pgdm.errors import ConfigError, UnknownNameError
+
+_SHORT = {
+    "-h": "--help",
+    "-m": "--multirun",
+    "-c": "--cfg",
+    "-p": "--package",
+    "-i": "--info",
+    "-cd": "--config-dir",
+    "-sc": "--shell-completion",
+}
+_INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+# Flags with a value, and what it may be (None: anything).
+_VALUES: dict[str, tuple[str, ...] | None] = {
+    "--cfg": ("job", "hydra", "all"),
+    "--package": None,
+    "--config-dir": None,
+    "--info": _INFO,
+}
+_OURS = ("--help", "--version", "--debug", "--offline")
+_HYDRAS = ("--multirun", "--resolve", "--hydra-help", "--shell-completion")
+
+
+@dataclass
+class Flags:
+    """What a command line asks for."""
+
+    ours: set[str] = field(default_factory=set)
+    """Those of ``--help --version --debug --offline`` that are there."""
+    hydras: list[str] = field(default_factory=list)
+    """What Hydra gets of the flags, in its own form."""
+    overrides: list[str] = field(default_factory=list)
+    """Everything else: ``key=value``."""
+    config_dir: str | None = None
+    """The user's own settings folder."""
+
+    @property
+    def multirun(self) -> bool:
+        """Whether several runs are asked for."""
+        return "--multirun" in self.hydras
+
+
+def read_flags(arguments: Sequence[str]) -> Flags:
+    """Sort a command line.
+
+    Raises:
+        ConfigError: if a flag is unknown, or lacks its value.
+    """
+    flags, waiting = Flags(), list(arguments)
+    while waiting:
+        token = waiting.pop(0)
+        if not token.startswith("-"):
+            flags.overrides.append(token)
+            continue
+        name, joined, value = token.partition("=")
+        name = _SHORT.get(name, name)
+        if name in _VALUES:
+            _add_with_value(flags, name, value if joined else None, waiting)
+        elif joined or name not in (*_OURS, *_HYDRAS):
+            raise UnknownNameError("flag", token, [*_OURS, *_HYDRAS, *_VALUES])
+        elif name in _OURS:
+            flags.ours.add(name)
+        else:
+            flags.hydras.append(name)
+    if "--offline" in flags.ours:
+        flags.overrides.append("offline=true")
+    return flags
+
+
+def _add_with_value(flags: Flags, name: str, value: str | None, waiting: list[str]) -> None:
+    valid = _VALUES[name]
+    if name == "--info" and value is None and (not waiting or waiting[0] not in _INFO):
+        value = "all"
+    if value is None:
+        if not waiting or waiting[0].startswith("-"):
+            raise ConfigError(f"{name} needs a value: {' or '.join(valid or ('one',))}")
+        value = waiting.pop(0)
+    if valid is not None and value not in valid:
+        raise UnknownNameError(f"{name} value", value, valid)
+    if name == "--config-dir":
+        flags.config_dir = value
+    flags.hydras += [name, value]

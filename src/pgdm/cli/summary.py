@@ -1,0 +1,103 @@
+"""A finished run in one table: before, after, and what the paper reports."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from pgdm.tracking.run_log import Record, RunLog, metrics_of
+
+if TYPE_CHECKING:
+    from pgdm.config.schema import ExperimentCfg
+
+PAPER_FRAMES = 50_000_000
+"""Environment steps behind each of the paper's figures (mean of 3 seeds, sampled actions)."""
+
+
+@dataclass(frozen=True)
+class _Row:
+    name: str
+    label: str
+    form: str
+    paper: str = ""  # attribute of the task with the paper's figure
+
+
+_ROWS = (
+    _Row("success", "success (within 1 cm)", ".1%", "paper_success"),
+    _Row("com_error_released", "COM error, released form [m]", ".2e", "paper_com_error"),
+    _Row("com_error", "COM error, mean [m]", ".4f"),
+    _Row("ori_error", "rotation error [rad]", ".3f"),
+    _Row("lifted", "lifted", ".1%"),
+    _Row("dropped", "dropped", ".1%"),
+    _Row("length", "episode length [steps]", ".1f"),
+    _Row("return", "return", ".1f"),
+)
+
+
+def evaluations(run_dir: Path) -> list[Record]:
+    """Return a run's evaluations, oldest first."""
+    records = RunLog(run_dir / "metrics.jsonl").read()
+    return [record for record in records if record["kind"] == "eval"]
+
+
+def summary_table(cfg: ExperimentCfg, records: list[Record]) -> Table:
+    """Return the table of a run.
+
+    Args:
+        cfg: its settings.
+        records: its evaluations, oldest first; at least one.
+    """
+    first, last = records[0], records[-1]
+    before, after = metrics_of(first), metrics_of(last)
+    table = Table(title=_title(cfg), caption=_caption(cfg, int(last["frames"])))
+    table.add_column("metric")
+    heads = [f"before\n{first['frames']:,} frames", f"after\n{last['frames']:,} frames"]
+    heads += ["after\ndeterministic", f"paper\n{PAPER_FRAMES:,} frames"]
+    for head in heads:
+        table.add_column(head, justify="right")
+    for row in _ROWS:
+        paper = getattr(cfg.task, row.paper) if row.paper else None
+        table.add_row(
+            row.label,
+            _shown(before, f"eval_sampled/{row.name}", row.form),
+            _shown(after, f"eval_sampled/{row.name}", row.form),
+            _shown(after, f"eval_deterministic/{row.name}", row.form),
+            "" if paper is None else format(paper, row.form),
+        )
+    return table
+
+
+def _shown(metrics: Mapping[str, float], name: str, form: str) -> str:
+    value = metrics.get(name, math.nan)
+    return format(value, form) if math.isfinite(value) else "-"
+
+
+def _title(cfg: ExperimentCfg) -> str:
+    parts = f"{cfg.method.name}, {cfg.action.kind} action, {cfg.algo.name}"
+    return f"{cfg.task.id} ({parts}, seed {cfg.seed})"
+
+
+def _caption(cfg: ExperimentCfg, frames: int) -> str:
+    """Say how far the run may be set against the paper's figures."""
+    if cfg.task.paper_success is None:
+        return f"budget '{cfg.budget}'; the paper reports no figure for this task"
+    differs = [
+        text
+        for text, there in (
+            (f"{frames / PAPER_FRAMES:.1%} of the paper's frames", frames < PAPER_FRAMES),
+            (f"action={cfg.action.kind}", cfg.action.kind != "absolute"),
+            (f"algo={cfg.algo.name}", cfg.algo.name != "ppo"),
+            (f"obs={cfg.obs.layout}", cfg.obs.layout != "released"),
+            (f"pregrasp={cfg.pregrasp.source}", cfg.pregrasp.source != "planned"),
+            (f"ablation={cfg.ablation.name}", cfg.ablation.name != "none"),
+        )
+        if there
+    ]
+    if not differs:
+        return "the paper's settings; its figures are means of 3 seeds, this is one"
+    return f"budget '{cfg.budget}', not comparable with the paper's figures: {', '.join(differs)}"
