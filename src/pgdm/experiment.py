@@ -1,0 +1,307 @@
+"""The composition root: wires library, scene, MDP, learner and tracking into one run."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from pgdm.config.identity import check_continues
+from pgdm.config.saved import FILE, load_config, save_config
+from pgdm.config.schema import ExperimentCfg
+from pgdm.envs.build import EnvBuilder, EnvCfg
+from pgdm.envs.film import film_policy
+from pgdm.errors import PgdmError, RenderError, RunError
+from pgdm.library import Library, ensure
+from pgdm.methods import recipe
+from pgdm.rl.callback import Callback, Progress
+from pgdm.rl.checkpoint import CheckpointFolder
+from pgdm.rl.evaluate import Evaluator
+from pgdm.rl.trainer import Extras, Outcome, Trainer, TrainerCfg
+from pgdm.tracking import open_tracker
+from pgdm.tracking.provenance import git_revision, versions
+from pgdm.tracking.run_folder import LINK, RESULT, RunFolder, read_json, write_json
+from pgdm.tracking.run_log import RunLog, metrics_of
+from pgdm.tracking.tracker import Tracker
+
+_log = logging.getLogger(__name__)
+
+Notify = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """How a run ended."""
+
+    status: str
+    """``finished`` or ``interrupted``."""
+    run_dir: Path
+    frames: int
+    before: dict[str, float]
+    """Metrics of the first evaluation."""
+    after: dict[str, float]
+    """Metrics of the last evaluation."""
+    video: Path | None
+    """MP4 of the last evaluated policy, deterministic."""
+    asset_source: str
+
+
+def env_builder(cfg: ExperimentCfg, library: Library) -> EnvBuilder:
+    """Compile the task of an experiment."""
+    env = EnvCfg(cfg.task, cfg.hand, cfg.sim, cfg.pregrasp, cfg.obs, cfg.action)
+    return EnvBuilder(library, env, recipe(cfg.method))
+
+
+def threads(cfg: ExperimentCfg) -> int:
+    """Return the number of threads to use."""
+    return cfg.num_threads or len(os.sched_getaffinity(0))
+
+
+def run_experiment(
+    cfg: ExperimentCfg,
+    callbacks: Sequence[Callback] = (),
+    stop: Callable[[], bool] = lambda: False,
+    notify: Notify = _log.info,
+) -> RunResult:
+    """Train, evaluate and record one experiment in its run folder, or go on with it.
+
+    Args:
+        cfg: the experiment.
+        callbacks: listeners, such as a progress bar.
+        stop: asked at safe points; True saves and ends the run as ``interrupted``.
+        notify: told in a sentence what takes time or differs from what was asked.
+
+    Raises:
+        PgdmError: if the run cannot start, go on or be saved.
+    """
+    run_dir = Path(cfg.run_dir)
+    _check_folder(cfg, run_dir)
+    library = ensure(cfg.task.motion, cfg.offline, notify)
+    with _locked(run_dir):
+        builder = env_builder(cfg, library)
+        return Run(cfg, builder, run_dir, notify).train(callbacks, stop)
+
+
+class Run(Callback):
+    """One experiment in its folder; as a callback it records what the trainer does.
+
+    Args:
+        cfg: the experiment.
+        builder: its compiled task.
+        run_dir: its folder.
+        notify: told in a sentence what people should know.
+    """
+
+    def __init__(
+        self, cfg: ExperimentCfg, builder: EnvBuilder, run_dir: Path, notify: Notify
+    ) -> None:
+        self.cfg, self.builder, self.dir, self._notify = cfg, builder, run_dir, notify
+        self._log = RunLog(run_dir / "metrics.jsonl")
+        self._checkpoints = CheckpointFolder(run_dir / "checkpoints", cfg.checkpoint.keep_last)
+        self._facts = {
+            "asset_source": builder.scene.asset_source,
+            "motion_sha256": builder.motion.sha256,
+            "pregrasp_used": builder.mdp.start.source,
+            "git": git_revision(),
+        }
+        self._tracker: Tracker | None = None
+        self._trainer: Trainer | None = None
+        self._last_frames = -1
+        self._video: Path | None = None
+
+    def train(self, callbacks: Sequence[Callback], stop: Callable[[], bool]) -> RunResult:
+        """Train to the end, or until ``stop``."""
+        state = self._checkpoints.latest()
+        stored = read_json(self.dir / RESULT)
+        if state is not None and stored.get("status") == "finished":
+            if int(state["frames"]) >= self.cfg.total_frames:
+                self._notify(f"{self.dir} is finished already; its result:")
+                return self._stored_result(stored)
+        if self._facts["pregrasp_used"] != self.cfg.pregrasp.source:
+            self._notify(
+                f"pregrasp '{self.cfg.pregrasp.source}' is not stored for {self.cfg.task.id} in the "
+                f"{self._facts['asset_source']} assets; starting from '{self._facts['pregrasp_used']}'"
+            )
+        trainer = self._make_trainer((self, *callbacks), stop)
+        if state is not None:
+            self._check_assets(state["metadata"])
+            trainer.load_state_dict(state)
+            self._notify(f"continuing {self.dir} at {state['frames']:,} frames")
+        save_config(self.cfg, self.dir)
+        self._log.truncate(trainer.progress.frames if state is not None else -1)
+        self._trainer = trainer
+        self._tracker = open_tracker(self.cfg.tracking, RunFolder(self.dir), self._facts)
+        status = "failed"
+        try:
+            outcome = trainer.run()
+            status = outcome.status
+            return self._finish(outcome)
+        except PgdmError as error:
+            self._write_result("failed", trainer.progress, {}, str(error))
+            raise
+        finally:
+            self._tracker.finish("killed" if status == "interrupted" else status)
+
+    def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
+        """Record an iteration."""
+        self._record(progress, metrics, "train")
+
+    def on_evaluation(self, progress: Progress, metrics: dict[str, float]) -> None:
+        """Record an evaluation, and film it if asked."""
+        self._record(progress, metrics, "eval")
+        last = progress.frames >= progress.total_frames
+        if self.cfg.eval.video and (last or self.cfg.eval.video_every_eval):
+            self._film(progress)
+
+    def _make_trainer(self, callbacks: Sequence[Callback], stop: Callable[[], bool]) -> Trainer:
+        cfg, make = self.cfg, self.builder.make
+        count = threads(cfg)
+        env = make(cfg.num_envs, count, cfg.seed, dump_dir=self.dir / "diverged")
+        episodes = cfg.eval.episodes
+        evaluator = Evaluator(
+            lambda n: make(n, min(n, count), cfg.seed),
+            episodes,
+            # Without randomness in the task all deterministic episodes are the same.
+            episodes if cfg.task.randomize else 1,
+            cfg.seed,
+        )
+        trainer_cfg = TrainerCfg(
+            algo=cfg.algo,
+            seed=cfg.seed,
+            total_frames=cfg.total_frames,
+            eval_interval_frames=cfg.eval.interval_frames,
+            checkpoint_interval_s=cfg.checkpoint.interval_s,
+            device=cfg.device,
+            num_threads=count,
+        )
+        extras = Extras(
+            evaluation=evaluator,
+            checkpoints=self._checkpoints,
+            callbacks=callbacks,
+            stop=stop,
+            metadata={k: v for k, v in self._facts.items() if k != "git"},
+        )
+        return Trainer(env, trainer_cfg, extras)
+
+    def _check_assets(self, metadata: dict[str, Any]) -> None:
+        for key in ("asset_source", "motion_sha256", "pregrasp_used"):
+            if metadata.get(key) != self._facts[key]:
+                raise RunError(
+                    f"{self.dir} was started with {key} '{metadata.get(key)}', the library now has "
+                    f"'{self._facts[key]}'; choose another run_dir, or restore the library"
+                )
+
+    def _record(self, progress: Progress, metrics: dict[str, float], kind: str) -> None:
+        assert self._tracker is not None
+        self._log.append(
+            metrics,
+            frames=progress.frames,
+            iteration=progress.iteration,
+            time_s=progress.elapsed_s,
+            kind=kind,
+        )
+        self._tracker.log(metrics, progress.frames)
+
+    def _film(self, progress: Progress) -> None:
+        assert self._trainer is not None and self._tracker is not None
+        path = self.dir / "videos" / f"frames_{progress.frames:012d}.mp4"
+        model = self._trainer.model
+        env = self.builder.make(1, 1, self.cfg.seed, auto_reset=False)
+        try:
+            poster = film_policy(env, lambda obs: model.act(obs, deterministic=True), path)
+        except RenderError as error:
+            self._notify(f"no video: {error}")
+            return
+        self._video = path
+        self._tracker.video(path, poster, progress.frames)
+
+    def _finish(self, outcome: Outcome) -> RunResult:
+        assert self._tracker is not None
+        self._write_result(outcome.status, outcome.progress, outcome.evaluation)
+        for name in (FILE, RESULT):
+            self._tracker.artifact(self.dir / name)
+        kept = [*self._checkpoints.all()[-1:], self._checkpoints.best]
+        for path in kept:
+            if path.exists():
+                self._tracker.artifact(path, "checkpoints")
+        return self._stored_result(read_json(self.dir / RESULT))
+
+    def _write_result(
+        self, status: str, progress: Progress, metrics: dict[str, float], error: str = ""
+    ) -> None:
+        steps = progress.frames / progress.elapsed_s if progress.elapsed_s else 0.0
+        write_json(
+            self.dir / RESULT,
+            {
+                "status": status,
+                "task": self.cfg.task.id,
+                "budget": self.cfg.budget,
+                "frames": progress.frames,
+                "total_frames": progress.total_frames,
+                "wall_time_s": round(progress.elapsed_s, 1),
+                "steps_per_s": round(steps, 1),
+                "metrics": {k: v for k, v in metrics.items() if v == v},
+                "video": None if self._video is None else str(self._video.relative_to(self.dir)),
+                **self._facts,
+                "versions": versions(),
+                **({"error": error} if error else {}),
+            },
+        )
+
+    def _stored_result(self, stored: dict[str, Any]) -> RunResult:
+        evaluations = [r for r in self._log.read() if r["kind"] == "eval"]
+        before = metrics_of(evaluations[0]) if evaluations else {}
+        video = stored.get("video")
+        return RunResult(
+            status=stored["status"],
+            run_dir=self.dir,
+            frames=stored["frames"],
+            before=before,
+            after=stored["metrics"],
+            video=self.dir / video if video else None,
+            asset_source=stored["asset_source"],
+        )
+
+
+def _check_folder(cfg: ExperimentCfg, run_dir: Path) -> None:
+    """Check that a run may use its folder.
+
+    Raises:
+        RunError: if it holds something else, or what ``resume`` does not allow.
+    """
+    if run_dir.exists() and not run_dir.is_dir():
+        raise RunError(f"run_dir '{run_dir}' is a file; choose a folder")
+    if (run_dir / FILE).exists():
+        if cfg.resume == "never":
+            raise RunError(f"'{run_dir}' holds a run and resume=never; choose another run_dir")
+        old = load_config(run_dir)
+        check_continues(dataclasses.replace(old, run_dir=cfg.run_dir), cfg)
+        return
+    if cfg.resume == "must":
+        raise RunError(f"'{run_dir}' holds no run and resume=must; check run_dir")
+    if run_dir.is_dir() and any(p.name not in (".lock", LINK) for p in run_dir.iterdir()):
+        raise RunError(f"'{run_dir}' is not empty and holds no run; choose another run_dir")
+
+
+@contextlib.contextmanager
+def _locked(run_dir: Path) -> Iterator[None]:
+    """Keep other processes out of a run folder."""
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(run_dir / ".lock")
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise RunError(f"another process is using '{run_dir}'; wait for it or end it") from error
+    except OSError as error:
+        raise RunError(f"cannot write run_dir '{run_dir}': {error.strerror or error}") from error
+    try:
+        yield
+    finally:
+        lock.release()
