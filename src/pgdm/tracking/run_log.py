@@ -14,6 +14,7 @@ from pgdm.errors import RunError
 FILE_NAME = "metrics.jsonl"
 HEADER = ("frames", "iteration", "time_s", "kind")
 """Keys of a line that are not metrics."""
+_TAIL_BYTES = 65536  # more than the longest line
 
 _log = logging.getLogger(__name__)
 
@@ -85,6 +86,22 @@ class RunLog:
             kept.pop(key, None)  # so that the replacement stands at its own place
             kept[key] = record
         return list(kept.values())
+
+    def last(self) -> Record | None:
+        """Return the last whole line, or None; reads only the file's end.
+
+        Raises:
+            RunError: if the file exists but cannot be read.
+        """
+        try:
+            with open(self.path, "rb") as file:
+                file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
+                lines = file.read().split(b"\n")[:-1]
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
+        return next((record for line in reversed(lines) if (record := _parse(line))), None)
 
     def truncate(self, frames: int) -> int:
         """Drop all lines after ``frames``, which a resumed run will write again.

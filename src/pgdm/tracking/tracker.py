@@ -32,19 +32,17 @@ class Tracker(ABC):
     def log(self, metrics: Mapping[str, float], frames: int) -> None:
         """Record metrics at a number of frames (environment steps, all simulations together)."""
 
-    def params(self, config: Mapping[str, object]) -> None:  # noqa: B027 - optional by design
-        """Record the configuration of the run, a nested mapping of plain values."""
-
-    def artifact(self, path: Path, folder: str = "") -> None:  # noqa: B027
+    def artifact(self, path: Path, folder: str = "") -> None:  # noqa: B027 (optional by design)
         """Keep a copy of a file, in a folder of the run's artifacts."""
 
-    def video(self, path: Path, poster: Path | None, frames: int) -> None:  # noqa: B027
+    def video(self, path: Path, poster: Path, frames: int) -> None:  # noqa: B027 (optional)
         """Keep an MP4 of the policy after ``frames`` and its poster picture."""
 
-    def finish(self, status: str) -> None:  # noqa: B027
-        """Close the record with status ``finished``, ``failed`` or ``killed``.
+    def finish(self, status: str) -> None:  # noqa: B027 (optional)
+        """Close the record with status ``finished``, ``interrupted`` or ``failed``.
 
-        Called once, at the end of the process; waits a bounded time for what is under way.
+        Called once, last of all, when the run's folder is complete (``result.json`` written):
+        what of it is worth a copy is kept. Waits a bounded time for what is under way.
         """
 
 

@@ -1,0 +1,146 @@
+"""The tracker that mirrors a run to MLflow while it goes on."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections import deque
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from pathlib import Path
+
+from pgdm.tracking.mlflow import Mirror, Point, Store, Thin, find_run, points, store_uri
+from pgdm.tracking.run_folder import FACTS, RunFolder, runs_root
+from pgdm.tracking.tracker import Tracker, TrackingCfg
+
+FINISH_S = 30.0
+"""How long the end of a run waits for MLflow at most."""
+RETRY_S = 30.0
+"""Pause after a failure, before MLflow is tried again."""
+_POINTS_A_CALL = 20
+
+_log = logging.getLogger(__name__)
+
+
+class MlflowTracker(Tracker):
+    """Mirrors a run from a thread of its own, so that training never waits for MLflow.
+
+    Importing MLflow alone takes two seconds. Whatever fails there is warned of once and tried
+    again later; what is still missing at the end, ``pgdm runs sync`` fills in from the folder.
+
+    Args:
+        cfg: where to.
+        run_dir: the run's folder, with ``config.yaml`` and, when the run is resumed, the records
+            that it continues.
+        facts: what the folder does not tell yet: ``asset_source``, ``git``.
+    """
+
+    def __init__(self, cfg: TrackingCfg, run_dir: Path, facts: Mapping[str, str]) -> None:
+        self._cfg, self._folder = cfg, RunFolder(run_dir)
+        self._uri = cfg.uri or store_uri(runs_root(run_dir))
+        self._facts = {name: facts[name] for name in FACTS if name in facts}
+        self._earlier = self._folder.log.read()
+        self._thin = Thin(self._folder.total_frames())
+        self._points: deque[Point] = deque()
+        self._files: deque[tuple[Path, str]] = deque()
+        self._posters: deque[tuple[Path, int]] = deque()
+        self._mirror: Mirror | None = None
+        self._not_before, self._warned = 0.0, False
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="mlflow")
+        self._send()
+
+    def log(self, metrics: Mapping[str, float], frames: int) -> None:
+        """Record metrics; values that are not finite are left out."""
+        finite = {k: float(v) for k, v in metrics.items() if math.isfinite(float(v))}
+        if finite and self._thin.passes(frames, finite):
+            self._points.append((frames, int(1000 * time.time()), finite))
+            self._send()
+
+    def artifact(self, path: Path, folder: str = "") -> None:
+        """Copy a file; one that is gone by then is left out."""
+        self._files.append((path, folder))
+        self._send()
+
+    def video(self, path: Path, poster: Path, frames: int) -> None:
+        """Copy a film, and show its poster on the run's page."""
+        self._files.append((path, "videos"))
+        self._posters.append((poster, frames))
+        self._send()
+
+    def finish(self, status: str) -> None:
+        """Send what is left, then the folder's files and the status."""
+        last = self._pool.submit(self._end, status)
+        wait([last], FINISH_S)
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        if not last.done() or last.exception() is not None:
+            _log.warning(
+                "MLflow lacks the end of this run; `pgdm runs sync %s` fills it in",
+                runs_root(self._folder.path),
+            )
+
+    def _send(self) -> None:
+        self._pool.submit(self._flush).add_done_callback(self._note)
+
+    def _note(self, done: Future[None]) -> None:
+        error = None if done.cancelled() else done.exception()
+        if error is None or self._warned:
+            return
+        self._warned = True
+        _log.warning(
+            "MLflow at %s: %s: %s; training goes on, and `pgdm runs sync` fills in what is missing",
+            self._uri,
+            type(error).__name__,
+            (str(error).splitlines() or [""])[0],
+        )
+
+    def _flush(self) -> None:
+        """Send what waits; what could not be sent stays in the queues."""
+        if time.monotonic() < self._not_before:
+            return
+        self._not_before = time.monotonic() + RETRY_S  # unless all goes well
+        mirror = self._connected()
+        while self._points:
+            some = [self._points[i] for i in range(min(_POINTS_A_CALL, len(self._points)))]
+            mirror.log(some)
+            for _ in some:
+                self._points.popleft()
+        while self._files:
+            path, folder = self._files[0]
+            if path.exists():
+                mirror.artifact(path, folder)
+            self._files.popleft()
+        while self._posters:
+            poster, frames = self._posters[0]
+            if poster.exists():
+                mirror.poster(poster, frames)
+            self._posters.popleft()
+        self._not_before = 0.0
+
+    def _connected(self) -> Mirror:
+        """Return the mirror, opened at the first call; an earlier run's records come first."""
+        if self._mirror is not None:
+            return self._mirror
+        store = Store.open(self._uri, self._cfg.experiment)
+        run = find_run(store, self._folder)
+        mirror = Mirror(store, self._folder, run)
+        attempts = int(self._folder.link.get("attempts", 0)) + 1
+        mirror.link({**self._facts, "attempts": attempts})
+        if run is None:
+            mirror.log(points(self._folder, self._earlier))
+        else:
+            mirror.set_status("running")
+        mirror.describe({"attempts": str(attempts)})
+        mirror.artifacts()
+        self._mirror = mirror
+        return mirror
+
+    def _end(self, status: str) -> None:
+        self._not_before = 0.0
+        self._flush()
+        mirror = self._connected()
+        self._folder = RunFolder(self._folder.path)  # with the result that was written since
+        mirror.refresh(self._folder)
+        mirror.describe({})
+        mirror.artifacts()
+        mirror.set_status(status, time.time())

@@ -1,0 +1,64 @@
+"""What each logged number means, in one table: MLflow's descriptions and the docs show it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Metric(NamedTuple):
+    """One metric."""
+
+    name: str
+    """Without its group."""
+    groups: str
+    """``train``, ``eval`` or ``both``."""
+    unit: str
+    meaning: str
+
+
+METRICS = (
+    Metric("success", "both", "0..1", "share of steps with the object within 1 cm of its target"),
+    Metric("com_error", "both", "m", "mean distance of the object's centre of mass to its target"),
+    Metric(
+        "com_error_released",
+        "both",
+        "m",
+        "the released code's error, which the paper's tables show: Frobenius norm over T-1",
+    ),
+    Metric("ori_error", "both", "rad", "mean angle between object and target orientation"),
+    Metric("lifted", "both", "0..1", "of steps with a raised target, share with a raised object"),
+    Metric("dropped", "both", "0..1", "share of episodes that lifted the object and lost it again"),
+    Metric("length", "both", "steps", "control steps until the episode ended (25 a second)"),
+    Metric("return", "both", "reward", "sum of rewards of an episode"),
+    Metric("diverged", "both", "episodes", "episodes ended because the simulation diverged"),
+    Metric("term/<name>", "both", "reward", "weighted reward term, mean of a step"),
+    Metric("steps_per_s", "train", "1/s", "environment steps a second, learning included"),
+    Metric("loss_policy", "train", "-", "PPO's clipped policy loss"),
+    Metric("loss_value", "train", "reward^2", "squared error of the value, weighted"),
+    Metric("entropy", "train", "nat", "entropy of the action distribution"),
+    Metric("kl", "train", "nat", "approximate divergence of the policy from before its update"),
+    Metric("clip_fraction", "train", "0..1", "share of samples whose ratio was clipped"),
+    Metric("explained_variance", "train", "<=1", "variance of the returns the value explains"),
+    Metric("ess", "train", "0..1", "effective sample size of the importance weights, as a share"),
+    Metric("grad_norm", "train", "-", "norm of the gradient before clipping"),
+    Metric("action_std", "train", "-", "mean standard deviation of the actions (range -1..1)"),
+    Metric("lr", "train", "-", "learning rate"),
+)
+
+
+def markdown() -> str:
+    """Return the table for people: metric, unit, meaning; steps are frames."""
+    groups = {
+        "train": "`train/`",
+        "eval": "`eval_*/`",
+        "both": "`train/`, `eval_sampled/`, `eval_deterministic/`",
+    }
+    rows = "\n".join(
+        f"| `{m.name}` | {m.unit} | {m.meaning} | {groups[m.groups]} |" for m in METRICS
+    )
+    return (
+        "Step of every metric: frames, that is environment steps of all simulations together. "
+        "`train/` is of the episodes that ended in an iteration; `eval_sampled/` draws actions "
+        "(as the paper does), `eval_deterministic/` takes the mean action.\n\n"
+        f"| metric | unit | meaning | groups |\n|---|---|---|---|\n{rows}\n"
+    )

@@ -1,0 +1,201 @@
+"""Read what a run left in its folder, whatever state it is in."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pgdm import paths
+from pgdm.errors import RunError
+from pgdm.tracking.run_log import FILE_NAME, RunLog
+
+CONFIG, RESULT, LINK = "config.yaml", "result.json", "mlflow.json"
+ARTIFACTS = "mlflow-artifacts"
+"""Folder beside ``mlflow.db`` with MLflow's copies of files."""
+STATUSES = ("running", "finished", "interrupted", "failed")
+SILENT_S = 600.0
+"""A run without a result that wrote nothing for so long was killed."""
+
+# Tag of MLflow -> where its value stands in config.yaml.
+TAGS = {
+    "task": "task.id",
+    "hand": "hand.name",
+    "method": "method.name",
+    "ablation": "ablation.name",
+    "pregrasp_source": "pregrasp.source",
+    "algo": "algo.name",
+    "action": "action.kind",
+    "obs": "obs.layout",
+    "seed": "seed",
+    "budget": "budget",
+}
+FACTS = ("asset_source", "git")
+"""What only the run itself knew, kept in ``result.json`` and ``mlflow.json``."""
+
+
+class RunFolder:
+    """One run's folder; nothing is read before it is asked for.
+
+    Args:
+        path: the folder, which holds ``config.yaml``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.absolute()
+        self.log = RunLog(self.path / FILE_NAME)
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The run's configuration as plain containers.
+
+        Raises:
+            RunError: if ``config.yaml`` is missing or not a YAML mapping.
+        """
+        file = self.path / CONFIG
+        try:
+            config = yaml.safe_load(file.read_text())
+        except (OSError, ValueError, yaml.YAMLError) as error:
+            raise RunError(f"cannot read {file}: {_first_line(error)}") from error
+        if not isinstance(config, dict):
+            raise RunError(f"{file} is not a mapping of settings")
+        return config
+
+    @cached_property
+    def result(self) -> dict[str, Any]:
+        """What ``result.json`` says; empty if the run has not ended in good order."""
+        return read_json(self.path / RESULT)
+
+    @property
+    def link(self) -> dict[str, Any]:
+        """Which MLflow run mirrors this one; empty if none does."""
+        return read_json(self.path / LINK)
+
+    def setting(self, key: str) -> Any:
+        """Return a setting by its dotted key, or None if there is none."""
+        value: Any = self.config
+        for part in key.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
+        return value
+
+    def tags(self) -> dict[str, str]:
+        """Return what identifies the run, as text."""
+        found = {tag: self.setting(key) for tag, key in TAGS.items()}
+        found |= {fact: self.result.get(fact, self.link.get(fact)) for fact in FACTS}
+        texts = {name: _text(value) for name, value in found.items() if value is not None}
+        return {**texts, "run_dir": str(self.path)}
+
+    def name(self) -> str:
+        """Return a short name for people."""
+        parts = (self.setting(TAGS[tag]) for tag in ("task", "method", "algo"))
+        seed = self.setting("seed")
+        known = [str(part) for part in parts if part is not None]
+        return " ".join([*known, f"seed {seed}"]) if known else self.path.name
+
+    def status(self) -> str:
+        """Return one of ``STATUSES``; a run that was killed counts as interrupted."""
+        status = self.result.get("status")
+        if status is None or status == "running":
+            alive = time.time() - self.modified() < SILENT_S
+            return "running" if alive else "interrupted"
+        return status if status in STATUSES else "failed"
+
+    def total_frames(self) -> int:
+        """Return how long the run was to be, environment steps; 0 if that is not known."""
+        total = self.setting("total_frames")
+        return total if isinstance(total, int) else 0
+
+    def modified(self) -> float:
+        """Return when the run last wrote something, s since the epoch."""
+        files = (self.path / name for name in (FILE_NAME, RESULT, CONFIG))
+        return max((file.stat().st_mtime for file in files if file.exists()), default=0.0)
+
+    def started(self) -> float:
+        """Return about when the run started, s since the epoch."""
+        config, log = self.path / CONFIG, self.log.path
+        times = [config.stat().st_mtime] if config.exists() else [time.time()]
+        last = self.log.last()
+        if last is not None:
+            times.append(log.stat().st_mtime - float(last.get("time_s", 0.0)))
+        return min(times)
+
+    def artifacts(self) -> list[tuple[Path, str]]:
+        """Return the files worth a copy elsewhere, each with the folder it belongs in."""
+        plain = [(self.path / name, "") for name in (CONFIG, RESULT, FILE_NAME)]
+        checkpoints = self.path / "checkpoints"
+        newest = sorted(checkpoints.glob("frames_*.ckpt"))[-1:]
+        videos = sorted((self.path / "videos").glob("*.[mp][pn][4g]"))
+        files = plain + [(file, "videos") for file in videos]
+        files += [(file, "checkpoints") for file in [checkpoints / "best.ckpt", *newest]]
+        return [(file, place) for file, place in files if file.is_file()]
+
+
+def find_runs(root: Path) -> list[RunFolder]:
+    """Return all runs in a folder, at any depth, in the order of their paths."""
+    return [RunFolder(path) for path in sorted(_walk(root))]
+
+
+def runs_root(run_dir: Path) -> Path:
+    """Return the folder of runs that a run belongs to, where ``mlflow.db`` lies by default.
+
+    It is ``runs`` under the working directory for the runs inside it, and otherwise the folder
+    that holds the run's own.
+    """
+    run_dir, default = run_dir.absolute(), paths.runs().absolute()
+    return default if run_dir.is_relative_to(default) else run_dir.parent
+
+
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Return nested settings as dotted key to text."""
+    flat: dict[str, str] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and value:
+            flat |= flatten(value, f"{name}.")
+        else:
+            flat[name] = _text(value)
+    return flat
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return a JSON object from a file; empty if it is missing, damaged or something else."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON object, whole or not at all."""
+    temp = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temp.write_text(json.dumps(content, indent=1) + "\n")
+        os.replace(temp, path)
+    finally:
+        temp.unlink(missing_ok=True)
+
+
+def _walk(root: Path) -> Iterator[Path]:
+    for folder, subfolders, files in os.walk(root):
+        if CONFIG in files:
+            subfolders.clear()  # nothing inside a run is another run
+            yield Path(folder)
+        else:
+            subfolders[:] = [s for s in subfolders if s != ARTIFACTS and not s.startswith(".")]
+
+
+def _text(value: Any) -> str:
+    if value is None or isinstance(value, bool | list | dict):
+        return json.dumps(value)
+    return str(value)
+
+
+def _first_line(error: Exception) -> str:
+    return (getattr(error, "strerror", None) or str(error)).splitlines()[0]

@@ -1,0 +1,127 @@
+"""Rebuild MLflow from run folders: they are the truth, it is a mirror."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pgdm.errors import RunError, TrackingError
+from pgdm.tracking.mlflow import Mirror, Store, find_run, points, store_uri
+from pgdm.tracking.run_folder import RESULT, RunFolder, find_runs
+from pgdm.tracking.run_log import metrics_of
+
+EXPERIMENT = "pgdm"
+"""Where runs go whose configuration names no experiment."""
+_FINGERPRINT = "synced"
+
+
+@dataclass(frozen=True)
+class Synced:
+    """What was done about one run."""
+
+    folder: RunFolder
+    action: str
+    """``created``, ``completed``, ``rebuilt``, ``unchanged``, ``running`` or ``unreadable``."""
+    reason: str = ""
+
+
+def sync(
+    root: Path, uri: str | None = None, notify: Callable[[Synced], None] = lambda _: None
+) -> list[Synced]:
+    """Make MLflow show every run of a folder as its own records do.
+
+    Doing it again changes nothing. A run that goes on is left to its own process; a run whose
+    records MLflow contradicts is made anew there, and the wrong one moved to MLflow's trash.
+
+    Args:
+        root: folder of runs.
+        uri: store to fill; None: the one in a run's configuration, or ``mlflow.db`` in ``root``.
+        notify: told of each run.
+
+    Raises:
+        TrackingError: if a store cannot be used.
+    """
+    from mlflow.exceptions import MlflowException
+
+    stores: dict[tuple[str, str], Store] = {}
+    done = []
+    for folder in find_runs(root):
+        try:
+            place = uri or folder.setting("tracking.uri") or store_uri(root)
+            key = (str(place), str(folder.setting("tracking.experiment") or EXPERIMENT))
+            if key not in stores:
+                stores[key] = Store.open(*key)
+            outcome = _sync_run(stores[key], folder)
+        except RunError as error:
+            outcome = Synced(folder, "unreadable", str(error))
+        except (MlflowException, OSError) as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise TrackingError(f"MLflow refused {folder.path}: {reason}") from error
+        notify(outcome)
+        done.append(outcome)
+    return done
+
+
+def _sync_run(store: Store, folder: RunFolder) -> Synced:
+    run = find_run(store, folder)
+    status = folder.status()
+    if run is not None and status == "running":
+        return Synced(folder, "running")
+    fingerprint = _fingerprint(folder)
+    action = "created" if run is None else "completed"
+    wanted = points(folder, folder.log.read())
+    if run is not None and run.data.tags.get(_FINGERPRINT) == fingerprint:
+        action, wanted = "unchanged", []
+    elif run is not None:
+        there = _history(store, run.info.run_id, run.data.metrics)
+        if _contradicts(there, folder):
+            store.client.delete_run(run.info.run_id)
+            run, action = None, "rebuilt"
+        else:
+            wanted = [(step, at, _missing(there, step, m)) for step, at, m in wanted]
+    mirror = Mirror(store, folder, run)
+    mirror.log(wanted)
+    if action != "unchanged":
+        mirror.link({})
+        mirror.describe({_FINGERPRINT: fingerprint})
+        mirror.set_status(status, folder.modified())
+    mirror.artifacts()
+    return Synced(folder, action)
+
+
+def _history(store: Store, run_id: str, names: dict[str, float]) -> dict[str, dict[int, float]]:
+    """Return the last value of each metric at each step."""
+    found: dict[str, dict[int, float]] = {}
+    for name in names:
+        entries = store.client.get_metric_history(run_id, name)
+        found[name] = {e.step: e.value for e in sorted(entries, key=lambda e: e.timestamp)}
+    return found
+
+
+def _contradicts(there: dict[str, dict[int, float]], folder: RunFolder) -> bool:
+    """Return whether MLflow shows something that the run's records do not say."""
+    truth = {
+        (name, int(record["frames"])): value
+        for record in folder.log.read()
+        for name, value in metrics_of(record).items()
+    }
+    return any(
+        truth.get((name, step)) != value
+        for name, steps in there.items()
+        for step, value in steps.items()
+    )
+
+
+def _missing(
+    there: dict[str, dict[int, float]], step: int, metrics: dict[str, float]
+) -> dict[str, float]:
+    return {name: value for name, value in metrics.items() if step not in there.get(name, {})}
+
+
+def _fingerprint(folder: RunFolder) -> str:
+    digest = hashlib.sha256()
+    for file in (folder.log.path, folder.path / RESULT):
+        digest.update(file.read_bytes() if file.exists() else b"-")
+    return digest.hexdigest()[:16]
