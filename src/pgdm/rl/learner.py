@@ -197,7 +197,7 @@ def explained_variance(values: Tensor, target: Tensor) -> float:
 
 def _not_finite(terms: LossTerms, norm: Tensor) -> str:
     names = ("loss_policy", "loss_value", "entropy")
-    values = {name: float(term) for name, term in zip(names, terms[1:4], strict=True)}
+    values = {n: float(term.detach()) for n, term in zip(names, terms[1:4], strict=True)}
     values["grad_norm"] = float(norm)
     bad = next((name for name, value in values.items() if not math.isfinite(value)), "loss")
     shown = ", ".join(f"{name} {value:g}" for name, value in values.items())
