@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import Any
 
 from pgdm.tracking.mlflow import Mirror, Point, Store, Thin, find_run, points, store_uri
 from pgdm.tracking.run_folder import FACTS, RunFolder, runs_root
@@ -31,15 +32,14 @@ class MlflowTracker(Tracker):
 
     Args:
         cfg: where to.
-        run_dir: the run's folder, with ``config.yaml`` and, when the run is resumed, the records
-            that it continues.
-        facts: what the folder does not tell yet: ``asset_source``, ``git``.
+        folder: the run, with ``config.yaml`` and, when it is resumed, the records it continues.
+        facts: what the folder does not tell yet, see ``run_folder.FACTS``; None where unknown.
     """
 
-    def __init__(self, cfg: TrackingCfg, run_dir: Path, facts: Mapping[str, str]) -> None:
-        self._cfg, self._folder = cfg, RunFolder(run_dir)
-        self._uri = cfg.uri or store_uri(runs_root(run_dir))
-        self._facts = {name: facts[name] for name in FACTS if name in facts}
+    def __init__(self, cfg: TrackingCfg, folder: RunFolder, facts: Mapping[str, Any]) -> None:
+        self._cfg, self._folder = cfg, folder
+        self._uri = cfg.uri or store_uri(runs_root(folder.path))
+        self._facts = {name: facts[name] for name in FACTS if facts.get(name) is not None}
         self._earlier = self._folder.log.read()
         self._thin = Thin(self._folder.total_frames())
         self._points: deque[Point] = deque()

@@ -28,6 +28,7 @@ STATUS = {
     "running": "RUNNING",
     "finished": "FINISHED",
     "interrupted": "KILLED",
+    "killed": "KILLED",
     "failed": "FAILED",
 }
 _BATCH = 1000  # metrics in one call, the server's limit

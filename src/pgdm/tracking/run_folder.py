@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from filelock import FileLock, Timeout
 
 from pgdm import paths
 from pgdm.errors import RunError
@@ -20,8 +21,10 @@ CONFIG, RESULT, LINK = "config.yaml", "result.json", "mlflow.json"
 ARTIFACTS = "mlflow-artifacts"
 """Folder beside ``mlflow.db`` with MLflow's copies of files."""
 STATUSES = ("running", "finished", "interrupted", "failed")
+LOCK = ".lock"
+"""Held by the process that works in the folder."""
 SILENT_S = 600.0
-"""A run without a result that wrote nothing for so long was killed."""
+"""Where locks cannot be asked: a run without a result that was silent for so long was killed."""
 
 # Tag of MLflow -> where its value stands in config.yaml.
 TAGS = {
@@ -36,7 +39,7 @@ TAGS = {
     "seed": "seed",
     "budget": "budget",
 }
-FACTS = ("asset_source", "git")
+FACTS = ("asset_source", "pregrasp_used", "motion_sha256", "git")
 """What only the run itself knew, kept in ``result.json`` and ``mlflow.json``."""
 
 
@@ -100,11 +103,28 @@ class RunFolder:
 
     def status(self) -> str:
         """Return one of ``STATUSES``; a run that was killed counts as interrupted."""
+        locked = self._locked()
+        if locked:
+            return "running"
         status = self.result.get("status")
-        if status is None or status == "running":
-            alive = time.time() - self.modified() < SILENT_S
-            return "running" if alive else "interrupted"
-        return status if status in STATUSES else "failed"
+        if status is not None:
+            return status if status in STATUSES else "failed"
+        silent = locked is False or time.time() - self.modified() > SILENT_S
+        return "interrupted" if silent else "running"
+
+    def _locked(self) -> bool | None:
+        """Return whether a process works in the folder; None if that cannot be told."""
+        if not (self.path / LOCK).exists():
+            return None
+        lock = FileLock(self.path / LOCK)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            return True
+        except (OSError, NotImplementedError):
+            return None
+        lock.release()
+        return False
 
     def total_frames(self) -> int:
         """Return how long the run was to be, environment steps; 0 if that is not known."""
