@@ -25,9 +25,9 @@ from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.rl.evaluate import Evaluator
 from pgdm.rl.trainer import Extras, Outcome, Trainer, TrainerCfg
-from pgdm.tracking import open_tracker
+from pgdm.tracking import build_tracker
 from pgdm.tracking.provenance import git_revision, versions
-from pgdm.tracking.run_folder import LINK, RESULT, RunFolder, read_json, write_json
+from pgdm.tracking.run_folder import LINK, RESULT, read_json, write_json
 from pgdm.tracking.run_log import RunLog, metrics_of
 from pgdm.tracking.tracker import Tracker
 
@@ -137,7 +137,7 @@ class Run(Callback):
         save_config(self.cfg, self.dir)
         self._log.truncate(trainer.progress.frames if state is not None else -1)
         self._trainer = trainer
-        self._tracker = open_tracker(self.cfg.tracking, RunFolder(self.dir), self._facts)
+        self._tracker = build_tracker(self.cfg.tracking, self.dir, self._tags())
         status = "failed"
         try:
             outcome = trainer.run()
@@ -147,7 +147,7 @@ class Run(Callback):
             self._write_result("failed", trainer.progress, {}, str(error))
             raise
         finally:
-            self._tracker.finish("killed" if status == "interrupted" else status)
+            self._tracker.finish(status)
 
     def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
         """Record an iteration."""
@@ -159,6 +159,9 @@ class Run(Callback):
         last = progress.frames >= progress.total_frames
         if self.cfg.eval.video and (last or self.cfg.eval.video_every_eval):
             self._film(progress)
+
+    def _tags(self) -> dict[str, str]:
+        return {name: str(value) for name, value in self._facts.items() if value is not None}
 
     def _make_trainer(self, callbacks: Sequence[Callback], stop: Callable[[], bool]) -> Trainer:
         cfg, make = self.cfg, self.builder.make
@@ -223,14 +226,7 @@ class Run(Callback):
         self._tracker.video(path, poster, progress.frames)
 
     def _finish(self, outcome: Outcome) -> RunResult:
-        assert self._tracker is not None
         self._write_result(outcome.status, outcome.progress, outcome.evaluation)
-        for name in (FILE, RESULT):
-            self._tracker.artifact(self.dir / name)
-        kept = [*self._checkpoints.all()[-1:], self._checkpoints.best]
-        for path in kept:
-            if path.exists():
-                self._tracker.artifact(path, "checkpoints")
         return self._stored_result(read_json(self.dir / RESULT))
 
     def _write_result(
