@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -38,8 +37,6 @@ class ProgressView(callback.Callback):
         """Begin the display where the training begins, or goes on."""
         done = trainer.progress
         self._first_frames, self._first_s = done.frames, time.monotonic()
-        if done.frames:
-            self._console.print(f"going on at {done.frames:,} of {done.total_frames:,} frames")
         if self._console.is_terminal:
             columns = (
                 TextColumn("{task.description}"),
@@ -103,9 +100,3 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
-
-
-def latest_video(run_dir: Path) -> Path | None:
-    """Return the newest video of a run, if it has one."""
-    videos = sorted((run_dir / "videos").glob("*.mp4"), key=lambda path: path.stat().st_mtime)
-    return videos[-1] if videos else None

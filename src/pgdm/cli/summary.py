@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from pgdm.tracking.run_log import Record, RunLog, metrics_of
-
 if TYPE_CHECKING:
     from pgdm.config.schema import ExperimentCfg
+    from pgdm.experiment import RunResult
 
 PAPER_FRAMES = 50_000_000
 """Environment steps behind each of the paper's figures (mean of 3 seeds, sampled actions)."""
@@ -39,34 +37,20 @@ _ROWS = (
 )
 
 
-def evaluations(run_dir: Path) -> list[Record]:
-    """Return a run's evaluations, oldest first."""
-    records = RunLog(run_dir / "metrics.jsonl").read()
-    return [record for record in records if record["kind"] == "eval"]
-
-
-def summary_table(cfg: ExperimentCfg, records: list[Record]) -> Table:
-    """Return the table of a run.
-
-    Args:
-        cfg: its settings.
-        records: its evaluations, oldest first; at least one.
-    """
-    first, last = records[0], records[-1]
-    before, after = metrics_of(first), metrics_of(last)
-    table = Table(title=_title(cfg), caption=_caption(cfg, int(last["frames"])))
+def summary_table(cfg: ExperimentCfg, result: RunResult) -> Table:
+    """Return the table of a run: its first evaluation, its last, and the paper's figures."""
+    table = Table(title=_title(cfg), caption=_caption(cfg, result.frames))
     table.add_column("metric")
-    heads = [f"before\n{first['frames']:,} frames", f"after\n{last['frames']:,} frames"]
-    heads += ["after\ndeterministic", f"paper\n{PAPER_FRAMES:,} frames"]
-    for head in heads:
+    heads = ["before", f"after\n{result.frames:,} frames", "after\ndeterministic"]
+    for head in [*heads, f"paper\n{PAPER_FRAMES:,} frames"]:
         table.add_column(head, justify="right")
     for row in _ROWS:
         paper = getattr(cfg.task, row.paper) if row.paper else None
         table.add_row(
             row.label,
-            _shown(before, f"eval_sampled/{row.name}", row.form),
-            _shown(after, f"eval_sampled/{row.name}", row.form),
-            _shown(after, f"eval_deterministic/{row.name}", row.form),
+            _shown(result.before, f"eval_sampled/{row.name}", row.form),
+            _shown(result.after, f"eval_sampled/{row.name}", row.form),
+            _shown(result.after, f"eval_deterministic/{row.name}", row.form),
             "" if paper is None else format(paper, row.form),
         )
     return table

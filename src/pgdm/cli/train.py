@@ -1,0 +1,49 @@
+"""One run, as a person watches it."""
+
+from __future__ import annotations
+
+import sys
+
+from rich.console import Console
+
+from pgdm.cli.progress import ProgressView
+from pgdm.cli.stop import StopRequest
+from pgdm.cli.summary import summary_table
+from pgdm.config.schema import ExperimentCfg
+from pgdm.experiment import RunResult, run_experiment
+
+
+def train(cfg: ExperimentCfg) -> int:
+    """Do a run, or go on with it, and return the exit code.
+
+    Progress goes to stderr, the result to stdout.
+
+    Raises:
+        PgdmError: if the run fails.
+    """
+    progress = Console(stderr=True)
+    view = ProgressView(cfg.task.id, progress)
+
+    def notify(text: str) -> None:
+        progress.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    with StopRequest() as stop:
+        result = run_experiment(cfg, (view,), stop, notify)
+    if result.status == "interrupted":
+        print(
+            f"stopped and saved at {result.frames:,} of {cfg.total_frames:,} frames in "
+            f"{result.run_dir}; the same command goes on",
+            file=sys.stderr,
+        )
+        return stop.exit_code
+    _show(cfg, result)
+    return 0
+
+
+def _show(cfg: ExperimentCfg, result: RunResult) -> None:
+    console = Console()
+    console.print(summary_table(cfg, result))
+    # Not through rich: a path must stay whole on its line.
+    print(f"run:    {result.run_dir}")
+    if result.video is not None:
+        print(f"video:  {result.video}")

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from pgdm.config.identity import (
+    check_continues,
+    default_run_dir,
+    difference,
+    identity,
+    identity_hash,
+)
+from pgdm.config.store import compose
+from pgdm.errors import RunError
+
+BESIDE = [
+    "run_dir=elsewhere", "resume=must", "offline=true", "budget=smoke", "num_threads=1",
+    "total_frames=123", "tracking=none", "checkpoint.interval_s=5", "eval.interval_frames=7",
+    "eval.video=false", "eval.video_every_eval=true", "task.paper_success=0.5",
+]  # fmt: skip
+CHANGES = [
+    "seed=1", "num_envs=64", "task=duck-lift", "hand=dhand", "pregrasp=mined", "obs=paper",
+    "action=residual", "algo=ppo_fast", "algo.clip=0.1", "method.reward.lift_weight=0",
+    "sim.solver_iterations=10", "eval.episodes=5", "task.timestep_s=0.002",
+    "pregrasp.fallback=null",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("override", BESIDE)
+def test_what_is_beside_the_result_changes_nothing(override: str) -> None:
+    assert identity_hash(compose([override])) == identity_hash(compose())
+
+
+@pytest.mark.parametrize("override", CHANGES)
+def test_what_changes_the_result_changes_the_hash(override: str) -> None:
+    changed = compose([override])
+    assert identity_hash(changed) != identity_hash(compose())
+    assert default_run_dir(changed) != default_run_dir(compose())
+
+
+def test_the_hash_is_the_same_in_every_process() -> None:
+    code = "from pgdm.config.store import compose; print(compose(['seed=3']).run_dir)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == compose(["seed=3"]).run_dir
+
+
+def test_the_folder_says_what_is_in_it() -> None:
+    cfg = compose(
+        ["task=cup-pour1", "seed=7", "action=residual", "algo=ppo_fast", "pregrasp=mined"]
+    )
+    start = "runs/cup-pour1/pgdm/mined-residual-ppo_fast-s7-"
+    assert cfg.run_dir == f"{start}{identity_hash(cfg)}"
+
+
+def test_a_folder_given_is_kept() -> None:
+    assert compose(["run_dir=out/a"]).run_dir == "out/a"
+
+
+def test_identity_is_of_plain_values() -> None:
+    plain = identity(compose())
+    assert plain["algo.hidden"] == [256, 128]
+    assert plain["task.placements"][0]["body"] == "hammer/object"
+    assert not any(key.startswith(("tracking", "checkpoint")) for key in plain)
+
+
+def test_the_difference_has_both_values() -> None:
+    changed = compose(["seed=3", "algo.clip=0.1"])
+    assert difference(compose(), changed) == ["algo.clip: 0.2 -> 0.1", "seed: 0 -> 3"]
+
+
+def test_a_run_may_grow() -> None:
+    check_continues(compose(["total_frames=10"]), compose(["total_frames=20", "budget=smoke"]))
+
+
+def test_a_run_may_not_shrink_or_become_another() -> None:
+    with pytest.raises(RunError, match=r"total_frames: 20 -> 10 \(it may only grow\)"):
+        check_continues(compose(["total_frames=20"]), compose(["total_frames=10"]))
+    with pytest.raises(RunError, match=r"'out/a' .*seed: 0 -> 3.*choose another run_dir"):
+        check_continues(compose(["run_dir=out/a"]), compose(["run_dir=out/a", "seed=3"]))

@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import ast
+import dataclasses
+import typing
+from pathlib import Path
+
+import pytest
+
+import pgdm
+from pgdm.config.describe import describe
+from pgdm.config.groups import available, conf_dir, groups
+from pgdm.config.schema import ExperimentCfg
+from pgdm.config.store import compose
+from pgdm.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["num_envs=-1"], "num_envs is -1; it must be at least 1"),
+        (["num_envs=0"], "num_envs is 0"),
+        (["num_threads=-1"], "num_threads is -1; it must be at least 0"),
+        (["total_frames=0"], "total_frames is 0; it must be at least 1"),
+        (["seed=-1"], "seed is -1"),
+        (["eval.episodes=0"], "eval.episodes is 0; it must be at least 1"),
+        (["eval.interval_frames=-1"], "eval.interval_frames is -1"),
+        (["checkpoint.keep_last=0"], "checkpoint.keep_last is 0"),
+        (["checkpoint.interval_s=0"], "checkpoint.interval_s is 0.0; it must be above 0"),
+        (["algo.learning_rate=0"], "algo.learning_rate is 0.0; it must be above 0"),
+        (["algo.gamma=1.1"], "algo.gamma is 1.1; it must be between 0 and 1"),
+        (["algo.hidden=[256,0]"], r"algo.hidden is \[256, 0\]; every width"),
+        (["algo.minibatch_size=300"], r"size 300 does not divide the 4096 .*such as 256$"),
+        (["algo.minibatch_size=5000"], "size 5000 does not divide the 4096 .*such as 4096$"),
+        (["num_envs=3"], r"num_envs 3 \* algo.steps_per_env 128"),
+        (["resume=maybe"], "unknown resume value 'maybe'.*auto, must, never"),
+        (["device=gpu"], "unknown device 'gpu'"),
+        (["pregrasp.source=mimed"], "unknown pregrasp.source value 'mimed'; did you mean mined"),
+        (["tracking.kind=wandb"], "unknown tracking.kind value 'wandb'"),
+        (["method.name=pgmd"], "unknown method.name value 'pgmd'; did you mean pgdm"),
+        (["run_dir=''"], "run_dir is empty"),
+        (["budget=''"], "budget is empty"),
+        (["task.objects=[]"], "task.objects is empty"),
+        (["task.placements=[{body: a, pos_m: [1], quat: null}]"], "pos_m has 1 numbers, not 3"),
+        (["task.placements=[{body: a, pos_m: null, quat: [0,0,0,0]}]"], "quat is zero"),
+        (["hand.fingertips=[16]"], "fingertips has 16, but hand.points has 16 entries"),
+        (["action=residual", "hand.num_base_joints=3"], "num_base_joints 3; use action=absolute"),
+    ],
+)  # fmt: skip
+def test_rules_between_the_fields(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        compose(["task.tracked_body=a/object", *overrides])
+
+
+def test_cuda_is_refused_where_there_is_none() -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        assert compose(["device=cuda"]).device == "cuda"
+    else:
+        with pytest.raises(ConfigError, match="torch finds no GPU here; use device=cpu"):
+            compose(["device=cuda"])
+
+
+def fields(cls: type, path: str = "") -> dict[str, type]:
+    """Return all keys of a configuration, dotted, with the dataclass that has them."""
+    found: dict[str, type] = {}
+    for name, hint in typing.get_type_hints(cls).items():
+        key = f"{path}.{name}" if path else name
+        inner = typing.get_args(hint)[0] if typing.get_origin(hint) is list else hint
+        if dataclasses.is_dataclass(inner):
+            found |= fields(typing.cast(type, inner), key)
+        else:
+            found[key] = cls
+    return found
+
+
+def test_every_key_is_read_somewhere() -> None:
+    """A key that nobody reads promises what the program does not do."""
+    root = Path(pgdm.__file__).parent
+    read: set[str] = set()
+    for file in root.rglob("*.py"):
+        if file.parent.name == "config":  # it checks them all, and uses none
+            continue
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Attribute):
+                read.add(node.attr)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                read.add(node.value)
+                read.add(node.value.rpartition(".")[2])
+    # Only a name so far: nothing is taken away before the ablations are there.
+    unread = [key for key in fields(ExperimentCfg) if key.rpartition(".")[2] not in read]
+    assert unread == []
+
+
+def test_every_field_says_what_it_means() -> None:
+    undocumented = []
+    for cls in {*fields(ExperimentCfg).values(), ExperimentCfg}:
+        module = Path(__import__("sys").modules[cls.__module__].__file__ or "")
+        tree = ast.parse(module.read_text())
+        node = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == cls.__name__)
+        for field, after in zip(node.body, [*node.body[1:], None], strict=True):
+            is_field = isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+            said = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            if is_field and not said:
+                undocumented.append(f"{cls.__name__}.{ast.unparse(field.target)}")
+            assert not (is_field and field.value), f"{cls.__name__}: defaults live in conf/"
+    assert undocumented == []
+
+
+def test_every_key_in_the_files_has_a_comment() -> None:
+    for group in groups():
+        inherited: set[str] = set()
+        files = {name: describe(conf_dir() / group / f"{name}.yaml") for name in available(group)}
+        if group == "task":
+            files = {"_tcdm": describe(conf_dir() / "task" / "_tcdm.yaml")}
+        for description in files.values():
+            if not description.defaults or group == "task":
+                inherited |= {key.name for key in description.keys if key.comment}
+        for name, description in files.items():
+            assert description.title, f"{group}/{name}.yaml has no comment at its top"
+            if group == "experiment":
+                continue
+            for key in description.keys:
+                known = key.comment or key.name.removeprefix(f"{group}.") in inherited
+                assert known or key.name in ("num_envs",), f"{group}/{name}.yaml: {key.name}"
+    assert all(key.comment for key in describe(conf_dir() / "config.yaml").keys)
