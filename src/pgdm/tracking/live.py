@@ -15,7 +15,7 @@ from pgdm.tracking.mlflow import Mirror, Point, Store, Thin, find_run, points, s
 from pgdm.tracking.run_folder import FACTS, RunFolder, runs_root
 from pgdm.tracking.tracker import Tracker, TrackingCfg
 
-FINISH_S = 30.0
+FINISH_S = 60.0
 """How long the end of a run waits for MLflow at most."""
 RETRY_S = 30.0
 """Pause after a failure, before MLflow is tried again."""

@@ -140,9 +140,9 @@ class RunFolder:
         """Return about when the run started, s since the epoch."""
         config, log = self.path / CONFIG, self.log.path
         times = [config.stat().st_mtime] if config.exists() else [time.time()]
-        last = self.log.last()
-        if last is not None:
-            times.append(log.stat().st_mtime - float(last.get("time_s", 0.0)))
+        lines = self.log.tail()
+        if lines:
+            times.append(log.stat().st_mtime - float(lines[-1].get("time_s", 0.0)))
         return min(times)
 
     def artifacts(self) -> list[tuple[Path, str]]:

@@ -14,7 +14,7 @@ from pgdm.errors import RunError
 FILE_NAME = "metrics.jsonl"
 HEADER = ("frames", "iteration", "time_s", "kind")
 """Keys of a line that are not metrics."""
-_TAIL_BYTES = 65536  # more than the longest line
+_TAIL_BYTES = 1 << 18  # a few hundred lines
 
 _log = logging.getLogger(__name__)
 
@@ -87,21 +87,23 @@ class RunLog:
             kept[key] = record
         return list(kept.values())
 
-    def last(self) -> Record | None:
-        """Return the last whole line, or None; reads only the file's end.
+    def tail(self) -> list[Record]:
+        """Return the last whole lines, as many as a short look at the file's end gives.
 
         Raises:
             RunError: if the file exists but cannot be read.
         """
         try:
             with open(self.path, "rb") as file:
-                file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
+                size = file.seek(0, os.SEEK_END)
+                file.seek(max(0, size - _TAIL_BYTES))
                 lines = file.read().split(b"\n")[:-1]
         except FileNotFoundError:
-            return None
+            return []
         except OSError as error:
             raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
-        return next((record for line in reversed(lines) if (record := _parse(line))), None)
+        whole = lines if size <= _TAIL_BYTES else lines[1:]
+        return [record for line in whole if (record := _parse(line))]
 
     def truncate(self, frames: int) -> int:
         """Drop all lines after ``frames``, which a resumed run will write again.
