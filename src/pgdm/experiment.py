@@ -25,7 +25,7 @@ from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.rl.evaluate import Evaluator
 from pgdm.rl.trainer import Extras, Outcome, Trainer, TrainerCfg
-from pgdm.tracking import build_tracker
+from pgdm.tracking import RunFolder, open_tracker
 from pgdm.tracking.provenance import git_revision, versions
 from pgdm.tracking.run_folder import LINK, RESULT, read_json, write_json
 from pgdm.tracking.run_log import RunLog, metrics_of
@@ -137,7 +137,7 @@ class Run(Callback):
         save_config(self.cfg, self.dir)
         self._log.truncate(trainer.progress.frames if state is not None else -1)
         self._trainer = trainer
-        self._tracker = build_tracker(self.cfg.tracking, self.dir, self._tags())
+        self._tracker = open_tracker(self.cfg.tracking, RunFolder(self.dir), self._facts)
         status = "failed"
         try:
             outcome = trainer.run()
@@ -159,9 +159,6 @@ class Run(Callback):
         last = progress.frames >= progress.total_frames
         if self.cfg.eval.video and (last or self.cfg.eval.video_every_eval):
             self._film(progress)
-
-    def _tags(self) -> dict[str, str]:
-        return {name: str(value) for name, value in self._facts.items() if value is not None}
 
     def _make_trainer(self, callbacks: Sequence[Callback], stop: Callable[[], bool]) -> Trainer:
         cfg, make = self.cfg, self.builder.make
