@@ -70,7 +70,7 @@ layers: dev
 	$(BIN)/python -m pytest -q tests/test_layers.py
 
 docs: dev
-	$(BIN)/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 serve: dev
 	$(BIN)/mkdocs serve

@@ -1,0 +1,111 @@
+"""The documentation builds without a warning, and its commands and recipes work."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pgdm.config.store import compose
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+DOCS = REPOSITORY / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+
+sys.path.insert(0, str(REPOSITORY / "tools"))
+import configuration_page  # noqa: E402 (tools/ is no package: nothing in src may import it)
+
+
+def test_the_page_of_settings_is_current() -> None:
+    page = configuration_page.PAGE.read_text(encoding="utf-8")
+    assert page == configuration_page.page(), "run: python tools/configuration_page.py"
+
+
+def test_every_setting_is_explained() -> None:
+    lines = configuration_page.page().splitlines()
+    assert [line for line in lines if line.startswith("| `") and line.endswith("|  |")] == []
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    text = (REPOSITORY / "mkdocs.yml").read_text(encoding="utf-8")
+    nav = set(re.findall(r"^  - [^:]+: (\S+\.md)$", text, re.MULTILINE))
+    assert nav == {page.name for page in PAGES}
+
+
+def test_the_site_builds_strictly(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) > len(PAGES)
+    # The site must work without a network: nothing is loaded from elsewhere.
+    loaded = r"""<(?:script|link|img)\b[^>]*\b(?:src|href)=["']?(?:https?:)?//(?!\S*["'][^>]*rel=.?canonical)"""
+    assert [p.name for p in pages if re.search(loaded, p.read_text(encoding="utf-8"))] == []
+
+
+def _commands() -> list[str]:
+    """Return every pgdm-run command of the documentation, in code blocks and in the text."""
+    found: set[str] = set()
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        found |= set(re.findall(r"^pgdm-run .*$", text, re.MULTILINE))
+        found |= set(re.findall(r"`(pgdm-run [^`\n]+)`", text))
+    placeholder = re.compile(r"[A-Z]{3,}|<|--config-dir|--help")
+    return sorted(command for command in found if not placeholder.search(command))
+
+
+@pytest.mark.parametrize("command", _commands())
+def test_settings_in_commands_exist(command: str) -> None:
+    words = [word for word in command.split()[1:] if not word.startswith("-")]
+    words = [word for word in words if word != "job"]
+    if " -m " in command:
+        words = [word.split(",")[0] for word in words]
+    compose(words)
+
+
+def _recipe(heading: str) -> dict[str, str]:
+    """Return the files that a section of docs/extending.md has its reader write."""
+    text = (DOCS / "extending.md").read_text(encoding="utf-8")
+    section = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    names = re.findall(
+        r"Write `(my/[^`]+\.yaml)`:\n\n    ```yaml\n(.*?)    ```", section, re.DOTALL
+    )
+    return {name: re.sub(r"(?m)^    ", "", body) for name, body in names}
+
+
+def _follow(heading: str, folder: Path) -> None:
+    files = _recipe(heading)
+    assert files, f"docs/extending.md writes no file under '{heading}'"
+    for name, body in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(body, encoding="utf-8")
+
+
+def test_recipe_for_a_suite_of_settings(tmp_path: Path) -> None:
+    _follow("A suite of settings", tmp_path)
+    cfg = compose(["+experiment=fast", "task=cup-pour1"], tmp_path / "my")
+    assert (cfg.action.kind, cfg.algo.name, cfg.total_frames) == ("residual", "ppo_fast", 1_000_000)
+    assert cfg.task.id == "cup-pour1"
+
+
+def test_recipe_for_a_task(tmp_path: Path, library_home: Path) -> None:
+    import torch
+
+    from pgdm.experiment import env_builder
+    from pgdm.library import open_library
+
+    _follow("A task", tmp_path)
+    cfg = compose(["task=dhand-hammer", "pregrasp=none"], tmp_path / "my")
+    assert cfg.hand.name == "dhand"
+    env = env_builder(cfg, open_library()).make(num_envs=2, num_threads=1)
+    obs, reward, *_ = env.step(torch.zeros(2, env.action_dim))
+    assert torch.isfinite(obs).all()
+    assert torch.isfinite(reward).all()
