@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -25,6 +25,13 @@ class _Row:
     paper: str = ""  # attribute of the task with the paper's figure
 
 
+@dataclass(frozen=True)
+class _Column:
+    head: str
+    metrics: Mapping[str, float]
+    prefix: str
+
+
 _ROWS = (
     _Row("success", "success (within 1 cm)", ".1%", "paper_success"),
     _Row("com_error_released", "COM error, released form [m]", ".2e", "paper_com_error"),
@@ -39,18 +46,40 @@ _ROWS = (
 
 def summary_table(cfg: ExperimentCfg, result: RunResult) -> Table:
     """Return the table of a run: its first evaluation, its last, and the paper's figures."""
-    table = Table(title=_title(cfg), caption=_caption(cfg, result.frames))
+    frames = result.frames
+    columns = [
+        _Column("before", result.before, "eval_sampled/"),
+        _Column(f"after\n{frames:,} frames", result.after, "eval_sampled/"),
+        _Column("after\ndeterministic", result.after, "eval_deterministic/"),
+    ]
+    return _table(cfg, columns, _caption(cfg, frames))
+
+
+def metrics_table(
+    cfg: ExperimentCfg, metrics: Mapping[str, float], frames: int, kinds: Sequence[str]
+) -> Table:
+    """Return the table of one evaluation.
+
+    Args:
+        cfg: settings of the run.
+        metrics: as ``Evaluator`` gives them.
+        frames: length of the training before it.
+        kinds: ``sampled``, ``deterministic`` or both.
+    """
+    columns = [_Column(kind, metrics, f"eval_{kind}/") for kind in kinds]
+    return _table(cfg, columns, _caption(cfg, frames))
+
+
+def _table(cfg: ExperimentCfg, columns: Sequence[_Column], caption: str) -> Table:
+    table = Table(title=_title(cfg), caption=caption)
     table.add_column("metric")
-    heads = ["before", f"after\n{result.frames:,} frames", "after\ndeterministic"]
-    for head in [*heads, f"paper\n{PAPER_FRAMES:,} frames"]:
+    for head in [*(column.head for column in columns), f"paper\n{PAPER_FRAMES:,} frames"]:
         table.add_column(head, justify="right")
     for row in _ROWS:
         paper = getattr(cfg.task, row.paper) if row.paper else None
         table.add_row(
             row.label,
-            _shown(result.before, f"eval_sampled/{row.name}", row.form),
-            _shown(result.after, f"eval_sampled/{row.name}", row.form),
-            _shown(result.after, f"eval_deterministic/{row.name}", row.form),
+            *(_shown(column.metrics, f"{column.prefix}{row.name}", row.form) for column in columns),
             "" if paper is None else format(paper, row.form),
         )
     return table

@@ -12,6 +12,13 @@ from pgdm.cli.summary import summary_table
 from pgdm.config.schema import ExperimentCfg
 from pgdm.experiment import RunResult, run_experiment
 
+_PROGRESS = Console(stderr=True)
+
+
+def notify(text: str) -> None:
+    """Tell what takes time, or differs from what was asked."""
+    _PROGRESS.print(text, markup=False, highlight=False, soft_wrap=True)
+
 
 def train(cfg: ExperimentCfg) -> int:
     """Do a run, or go on with it, and return the exit code.
@@ -21,12 +28,7 @@ def train(cfg: ExperimentCfg) -> int:
     Raises:
         PgdmError: if the run fails.
     """
-    progress = Console(stderr=True)
-    view = ProgressView(cfg.task.id, progress)
-
-    def notify(text: str) -> None:
-        progress.print(text, markup=False, highlight=False, soft_wrap=True)
-
+    view = ProgressView(cfg.task.id, _PROGRESS)
     with StopRequest() as stop:
         result = run_experiment(cfg, (view,), stop, notify)
     if result.status == "interrupted":

@@ -1,0 +1,138 @@
+"""``pgdm``: everything besides training."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pgdm.cli import assets, dashboard, runs
+from pgdm.cli.errors import EXPECTED, USAGE, one_line, report
+from pgdm.errors import ConfigError
+
+# click's ClickException, which typer brings as a copy of its own in newer versions.
+_WRONG_USAGE: type[Exception] = typer.BadParameter.mro()[2]
+
+app = typer.Typer(
+    name="pgdm",
+    help="Pre-Grasp informed Dexterous Manipulation. To train: pgdm-run --help.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+app.add_typer(assets.app, name="assets")
+app.add_typer(runs.app, name="runs")
+app.command("dashboard")(dashboard.dashboard)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``pgdm`` and return its exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    with one_line(debug):
+        try:
+            from pgdm.cli.run import set_up_logging
+
+            set_up_logging(debug)
+            code = typer.main.get_command(app).main(
+                arguments, prog_name="pgdm", standalone_mode=False
+            )
+            return code if isinstance(code, int) else 0
+        except _WRONG_USAGE as error:
+            return _report_usage(error, debug)
+        except typer.Abort:
+            return report(KeyboardInterrupt(), debug)
+        except EXPECTED as error:
+            return report(error, debug)
+
+
+def _report_usage(error: Exception, debug: bool) -> int:
+    form = getattr(error, "format_message", error.__str__)
+    if type(error).__name__ == "NoArgsIsHelpError":
+        print(form())  # the help
+        return USAGE
+    text = form()
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context is not None else "pgdm"
+    return report(ConfigError(f"{text.rstrip('.')}; see {command} --help"), debug)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"pgdm {version('pgdm')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error, and log more.")
+    ] = False,
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    del debug, version  # read before, and by its callback
+
+
+@app.command("eval")
+def evaluate(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="A run's folder, or a checkpoint file inside one.")
+    ],
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Episodes; by default as many as in the run.")
+    ] = None,
+    video: Annotated[bool, typer.Option("--video", help="Film the policy too.")] = False,
+    deterministic: Annotated[
+        bool, typer.Option("--deterministic", help="Only the mean action, without noise.")
+    ] = False,
+    best: Annotated[
+        bool, typer.Option("--best", help="Of a run: its best checkpoint, not its last.")
+    ] = False,
+    offline: Annotated[bool, typer.Option("--offline", help="Never use the network.")] = False,
+) -> None:
+    """Measure a trained policy."""
+    from pgdm.cli.evaluate import EvalRequest, evaluate_policy
+
+    request = EvalRequest(run, episodes, video, deterministic, best, offline)
+    raise typer.Exit(evaluate_policy(request))
+
+
+@app.command()
+def view(
+    task: Annotated[
+        str, typer.Argument(metavar="TASK", help="Such as hammer-use1; pgdm tasks lists them.")
+    ],
+    video: Annotated[
+        Path | None, typer.Option(help="Write an MP4 to this file instead of opening a window.")
+    ] = None,
+    pregrasp: Annotated[
+        str, typer.Option(help="Start state that shows the hand: planned, mined, learned or none.")
+    ] = "planned",
+    offline: Annotated[bool, typer.Option("--offline", help="Never use the network.")] = False,
+) -> None:
+    """Replay a task's exemplar motion with the hand at its pre-grasp."""
+    from pgdm.cli.view import view_task
+
+    view_task(task, video, pregrasp, offline)
+
+
+@app.command()
+def tasks(
+    tcdm30: Annotated[
+        bool, typer.Option("--tcdm30", help="Only the 30 tasks of the paper's comparisons.")
+    ] = False,
+) -> None:
+    """List the tasks."""
+    from pgdm.cli.tasks import print_tasks
+
+    print_tasks(tcdm30)
