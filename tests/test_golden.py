@@ -60,7 +60,7 @@ def test_first_steps_of_the_physics(golden: tuple[BatchEnv, dict]) -> None:
     env, record = golden
     env.reset()
     for k in range(3):
-        touching = env.sim.batch.get_data(0).ncon > 0
+        touching = env.sim.data(0).ncon > 0
         _, reward, terminated, _, info = env.step(torch.from_numpy(record["actions"][k])[None])
         tight = 1e-2 if touching else 1e-6
         np.testing.assert_allclose(info["qpos"][0], record["qpos"][k + 1], atol=tight)
@@ -104,8 +104,6 @@ def test_formulas_at_every_recorded_state(golden: tuple[BatchEnv, dict]) -> None
         ended = any(bool(end.reached(context)[0]) for end in mdp.recipe.ends)
         assert ended == bool(record["last"][k])
         pos[:, k + 1], quat[:, k + 1] = state.object_pos, state.object_quat
-        metrics = episode_metrics(
-            Episodes(pos, quat, t), reference, mdp.recipe.metrics
-        )
+        metrics = episode_metrics(Episodes(pos, quat, t), reference, mdp.recipe.metrics)
         assert abs(float(metrics["success"][0]) - record["obj_success"][k]) < 1e-9
         assert abs(float(metrics["com_error_released"][0]) - record["obj_err"][k]) < 1e-5

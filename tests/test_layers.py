@@ -26,6 +26,7 @@ FLOORS: list[set[str]] = [
     {"tracking"},
     {"config"},
     {"experiment"},
+    {"make"},  # environments by task id
     {"pgdm"},  # the package's own __init__: what `import pgdm` offers
     {"cli", "sweep", "report", "realworld", "hydra_plugins"},
 ]

@@ -44,7 +44,12 @@ def state(pos: list, quat: list) -> SimState:
 def context(pos: list, quat: list, target: list, target_quat: list, t: int = 1) -> StepContext:
     n = len(pos)
     return StepContext(
-        state(pos, quat), torch.full((n,), t), 5, double(target), double(target_quat), double([0.1] * n)
+        state(pos, quat),
+        torch.full((n,), t),
+        5,
+        double(target),
+        double(target_quat),
+        double([0.1] * n),
     )
 
 

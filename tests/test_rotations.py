@@ -12,7 +12,7 @@ from pgdm import rotations as rot
 
 finite = st.floats(-3.0, 3.0)
 quaternions = st.tuples(finite, finite, finite, finite).filter(
-    lambda v: 0.1 < math.sqrt(sum(x * x for x in v))
+    lambda v: math.sqrt(sum(x * x for x in v)) > 0.1
 )
 
 

@@ -23,7 +23,6 @@ from pgdm.pregrasp.sources import StartState
 from pgdm.sim.batch import SimBatch, SimState
 from pgdm.sim.randomize import Randomizer
 
-
 StepResult = tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]
 
 
@@ -227,9 +226,7 @@ class BatchEnv:
             keep, self._quat[self._rows, last], state.object_quat
         )
 
-    def _finish(
-        self, done: Tensor, diverged: Tensor, ends: dict[str, Tensor]
-    ) -> dict[str, Tensor]:
+    def _finish(self, done: Tensor, diverged: Tensor, ends: dict[str, Tensor]) -> dict[str, Tensor]:
         if not done.any():
             return {}
         episodes = Episodes(self._pos[done], self._quat[done], self._t[done])

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 import torch
 from gymnasium import spaces
 
 from pgdm.envs.batch_env import BatchEnv
+from pgdm.sim.batch import Data, Model
 from pgdm.sim.render import Renderer
 
 CONTROL_HZ = 25
@@ -36,18 +36,17 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.observation_space = spaces.Box(-np.inf, np.inf, (batch.obs_dim,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (batch.action_dim,), np.float32)
-        self._data = mujoco.MjData(self.model)
         self._renderer: Renderer | None = None
 
     @property
-    def model(self) -> mujoco.MjModel:
+    def model(self) -> Model:
         """MuJoCo's model of the scene."""
         return self._batch.sim.scene.model
 
     @property
-    def data(self) -> mujoco.MjData:
+    def data(self) -> Data:
         """MuJoCo's data in the current state: a copy, writing to it changes nothing."""
-        return self._batch.sim.batch.get_data(0, self._data)
+        return self._batch.sim.data(0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -81,7 +80,9 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._renderer = Renderer(scene.model, scene.index.object_body)
         t = int(self._batch.t[0])
         reference = self._batch.mdp.reference
-        return self._renderer.render(self.data, (reference.pos[t].numpy(), reference.quat[t].numpy()))
+        return self._renderer.render(
+            self.data, (reference.pos[t].numpy(), reference.quat[t].numpy())
+        )
 
     def close(self) -> None:
         """Free the renderer."""

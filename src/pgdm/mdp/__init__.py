@@ -1,0 +1,1 @@
+"""The MDP as short pure functions: observations, actions, rewards, ends, metrics."""

@@ -1,0 +1,1 @@
+"""Exemplar motions."""

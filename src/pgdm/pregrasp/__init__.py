@@ -1,0 +1,1 @@
+"""Pre-grasps: where an episode starts."""

@@ -1,0 +1,1 @@
+"""Scenes, batches of simulations, pictures."""

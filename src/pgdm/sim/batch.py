@@ -13,6 +13,9 @@ from torch import Tensor
 from pgdm.errors import SceneError
 from pgdm.sim.scene import Scene
 
+Model = mujoco.MjModel
+Data = mujoco.MjData
+
 _CURRENT = mujoco.mjtStage.mjSTAGE_VEL  # what the agent sees is current after the last substep
 
 
@@ -52,6 +55,7 @@ class SimBatch:
         self._f = {name: getattr(self._batch, name) for name in fields}
         derived = ("geom_xpos", "xquat", "xipos", "cvel", "subtree_com")
         self._d = {name: self._batch.bind(name) for name in derived}
+        self._scratch = mujoco.MjData(scene.model)
         index = scene.index
         self._bodies = np.append(index.point_bodies, index.object_body)
         self._roots = scene.model.body_rootid[self._bodies]
@@ -61,14 +65,13 @@ class SimBatch:
             self._batch.expand("geom_size")
 
     @property
-    def batch(self) -> mujoco_batch.Batch:
-        """The MuJoCo batch underneath."""
-        return self._batch
-
-    @property
     def rows(self) -> np.ndarray:
         """Whole integration state, one writable row a simulation, (N, nstate)."""
         return self._batch.state
+
+    def data(self, sim: int) -> mujoco.MjData:
+        """Return one simulation's MjData, a copy that its next call writes over."""
+        return self._batch.get_data(sim, self._scratch)
 
     def reset(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Restart simulations ids (k,) from qpos (nq,) and qvel (nv,)."""

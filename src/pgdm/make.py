@@ -1,0 +1,92 @@
+"""Environments by task id, for Python, Gymnasium and TorchRL."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from pgdm.config.groups import available
+from pgdm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pgdm.envs.batch_env import BatchEnv
+    from pgdm.envs.gym import PgdmEnv
+    from pgdm.envs.torchrl import PgdmTorchRLEnv
+
+_GROUPS = ("pregrasp", "obs", "action", "method", "ablation", "hand", "sim")
+
+
+def make_batch(
+    task: str,
+    *,
+    num_envs: int = 64,
+    num_threads: int = 0,
+    seed: int = 0,
+    auto_reset: bool = True,
+    offline: bool = False,
+    overrides: Sequence[str] = (),
+    **choices: str,
+) -> BatchEnv:
+    """Return N simulations of a task, stepped together on several threads.
+
+    Args:
+        task: task id, such as ``hammer-use1``.
+        num_envs: N.
+        num_threads: threads that step them; 0 takes one per core.
+        seed: for tasks that vary per reset.
+        auto_reset: whether finished rows restart by themselves.
+        offline: whether missing assets are an error instead of being fetched.
+        overrides: more settings, as on ``pgdm-run``'s command line.
+        choices: an option of a group by name: ``pregrasp="planned"``, ``obs="released"``,
+            ``action="absolute"``, ``method="pgdm"``, ``ablation="none"``.
+
+    Returns:
+        An env with ``reset() -> obs (N, D)`` and ``step(action (N, A)) -> obs, reward (N,),
+        terminated (N,), truncated (N,), info``; see `pgdm.envs.batch_env.BatchEnv.step`.
+
+    Raises:
+        ConfigError: if a name or value is wrong.
+        LibraryError: if the task's assets are missing.
+    """
+    for name in choices:
+        if name not in _GROUPS:
+            raise ConfigError(
+                f"make_batch has no argument '{name}'; groups: {', '.join(_GROUPS)}, "
+                "other settings go into overrides=['key=value']"
+            )
+    from pgdm.config.store import compose
+    from pgdm.experiment import env_builder
+    from pgdm.library import ensure
+
+    chosen = [f"{group}={option}" for group, option in choices.items()]
+    cfg = compose([f"task={task}", *chosen, *overrides])
+    builder = env_builder(cfg, ensure(cfg.task.motion, offline))
+    return builder.make(num_envs, num_threads, seed, auto_reset)
+
+
+def make_torchrl(task: str, *, num_envs: int = 64, **kwargs: Any) -> PgdmTorchRLEnv:
+    """Return N simulations of a task as a TorchRL EnvBase; arguments as `make_batch`."""
+    from pgdm.envs.torchrl import PgdmTorchRLEnv
+
+    return PgdmTorchRLEnv(make_batch(task, num_envs=num_envs, auto_reset=False, **kwargs))
+
+
+def make_gym(task: str, *, render_mode: str | None = None, **kwargs: Any) -> PgdmEnv:
+    """Return one simulation of a task as a Gymnasium env; arguments as `make_batch`.
+
+    This is what ``gymnasium.make("pgdm/<task>-v0", ...)`` calls.
+    """
+    from pgdm.envs.gym import PgdmEnv
+
+    batch = make_batch(task, num_envs=1, num_threads=1, auto_reset=False, **kwargs)
+    return PgdmEnv(batch, render_mode)
+
+
+def register() -> None:
+    """Tell Gymnasium of all tasks; it calls this itself when it is imported."""
+    import gymnasium
+
+    for task in available("task"):
+        gymnasium.register(
+            id=f"pgdm/{task}-v0", entry_point="pgdm.make:make_gym", kwargs={"task": task}
+        )
