@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import socket
@@ -28,6 +29,7 @@ HOST = "127.0.0.1"
 """Only this machine: MLflow asks for no password."""
 START_S = 120.0
 _STOP_S = 5.0
+_DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # never by a proxy
 _STOPPERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -53,7 +55,7 @@ def dashboard(
     with tempfile.TemporaryFile() as output, _served(_command(address, root, chosen), output) as ui:
         url = f"http://{HOST}:{chosen}"
         _wait_until_up(ui, url, output)
-        print(f"{url} shows the runs in {root} (Ctrl-C ends it)", flush=True)
+        print(f"the runs in {root} are shown at\n  {url}{_page(url)}\nCtrl-C ends it", flush=True)
         code = ui.wait()
         raise TrackingError(f"MLflow's pages ended with code {code}: {_last_line(output)}")
 
@@ -133,17 +135,31 @@ def _end(server: subprocess.Popen[bytes]) -> None:
 
 
 def _wait_until_up(server: subprocess.Popen[bytes], url: str, output: IO[bytes]) -> None:
-    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # never by a proxy
     end = time.monotonic() + START_S
     while time.monotonic() < end:
         if server.poll() is not None:
             raise TrackingError(f"MLflow's pages do not start: {_last_line(output)}")
         try:
-            with direct.open(f"{url}/health", timeout=2):
+            with _DIRECT.open(f"{url}/health", timeout=2):
                 return
         except (urllib.error.URLError, TimeoutError, ConnectionError):
             time.sleep(0.2)
     raise TrackingError(f"MLflow's pages do not answer at {url}: {_last_line(output)}")
+
+
+def _page(url: str) -> str:
+    """Return the page of the experiment used last, or the list of experiments."""
+    query = json.dumps({"max_results": 100, "order_by": ["last_update_time DESC"]}).encode()
+    address = f"{url}/api/2.0/mlflow/experiments/search"
+    request = urllib.request.Request(address, query, {"Content-Type": "application/json"})
+    try:
+        with _DIRECT.open(request, timeout=30) as answer:
+            found = json.load(answer).get("experiments", [])
+    except (OSError, ValueError):
+        found = []
+    ours = [str(e["experiment_id"]) for e in found if e.get("name") != "Default"]
+    place = f"experiments/{ours[0]}/runs" if ours else "experiments"
+    return f"/#/{place}?workflowType=machine_learning"
 
 
 def _last_line(output: IO[bytes]) -> str:

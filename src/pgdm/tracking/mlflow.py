@@ -34,6 +34,8 @@ STATUS = {
 _BATCH = 1000  # metrics in one call, the server's limit
 _PARAMS = 100  # parameters in one call, likewise
 _MACHINE_KEYS = ("run_dir", "resume")  # where a run lies is a tag: it may move
+# Without it the pages open as those of a language model's traces.
+_EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}
 _LOCK_S = 120.0
 _SETTINGS = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
@@ -116,7 +118,7 @@ def _experiment(client: MlflowClient, name: str, file: Path | None) -> str:
     found = client.get_experiment_by_name(name)
     if found is None:
         place = None if file is None else (file.parent / ARTIFACTS / name).as_uri()
-        tags = {"mlflow.note.content": metric_names.markdown()}
+        tags = {"mlflow.note.content": metric_names.markdown(), **_EXPERIMENT_TAGS}
         try:
             return client.create_experiment(name, artifact_location=place, tags=tags)
         except MlflowException:  # on a server somebody else may have been faster

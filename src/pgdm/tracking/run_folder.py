@@ -95,11 +95,11 @@ class RunFolder:
         return {**texts, "run_dir": str(self.path)}
 
     def name(self) -> str:
-        """Return a short name for people."""
-        parts = (self.setting(TAGS[tag]) for tag in ("task", "method", "algo"))
-        seed = self.setting("seed")
-        known = [str(part) for part in parts if part is not None]
-        return " ".join([*known, f"seed {seed}"]) if known else self.path.name
+        """Return a short name for people; what differs most comes first, as lists cut its end."""
+        tags = self.tags()
+        parts = [tags.get("task"), f"s{tags['seed']}" if "seed" in tags else None]
+        parts += [tags.get(tag) for tag in ("method", "algo", "action")]
+        return " ".join(part for part in parts if part) or self.path.name
 
     def status(self) -> str:
         """Return one of ``STATUSES``; a run that was killed counts as interrupted."""
