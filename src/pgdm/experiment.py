@@ -120,14 +120,15 @@ class Run(Callback):
         """Train to the end, or until ``stop``."""
         state = self._checkpoints.latest()
         stored = read_json(self.dir / RESULT)
-        if state is not None and stored.get("status") == "finished":
-            if int(state["frames"]) >= self.cfg.total_frames:
-                self._notify(f"{self.dir} is finished already; its result:")
-                return self._stored_result(stored)
-        if self._facts["pregrasp_used"] != self.cfg.pregrasp.source:
+        done = state is not None and int(state["frames"]) >= self.cfg.total_frames
+        if done and stored.get("status") == "finished":
+            self._notify(f"{self.dir} is finished already; its result:")
+            return self._stored_result(stored)
+        wanted, used = self.cfg.pregrasp.source, self._facts["pregrasp_used"]
+        if used != wanted:
             self._notify(
-                f"pregrasp '{self.cfg.pregrasp.source}' is not stored for {self.cfg.task.id} in the "
-                f"{self._facts['asset_source']} assets; starting from '{self._facts['pregrasp_used']}'"
+                f"pregrasp '{wanted}' is not stored for {self.cfg.task.id} in the "
+                f"{self._facts['asset_source']} assets; starting from '{used}'"
             )
         trainer = self._make_trainer((self, *callbacks), stop)
         if state is not None:

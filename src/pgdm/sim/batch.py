@@ -73,6 +73,10 @@ class SimBatch:
         """Return one simulation's MjData, a copy that its next call writes over."""
         return self._batch.get_data(sim, self._scratch)
 
+    def model(self, sim: int) -> mujoco.MjModel:
+        """Return one simulation's model, with what varies between simulations; a copy."""
+        return self._batch.get_model(sim)
+
     def reset(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Restart simulations ids (k,) from qpos (nq,) and qvel (nv,)."""
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
@@ -134,7 +138,8 @@ class SimBatch:
         """
         if rows.shape != self.rows.shape:
             raise SceneError(
-                f"stored simulation rows have shape {rows.shape}, this scene needs {self.rows.shape}"
+                f"stored simulation rows have shape {rows.shape}, "
+                f"this scene needs {self.rows.shape}"
             )
         self.rows[:] = rows
         self._batch.forward(stage=_CURRENT)
