@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from pgdm.library.catalog import Library, open_library
 from pgdm.library.motion_file import Motion, Start
+from pgdm.library.provide import ensure
+from pgdm.library.registry import fetch_registry
 from pgdm.library.report import Report
 from pgdm.library.tcdm import import_tcdm
 
-__all__ = ["Library", "Motion", "Report", "Start", "import_tcdm", "open_library"]
+__all__ = [
+    "Library",
+    "Motion",
+    "Report",
+    "Start",
+    "ensure",
+    "fetch_registry",
+    "import_tcdm",
+    "open_library",
+]

@@ -34,6 +34,7 @@ class SourceBuilder:
         self.folder = folder
         self.defects: list[str] = []
         self.left_out: dict[str, str] = {}
+        self.notes: dict[str, list[str]] = {}
         self._source, self._origin, self._root = source, origin, root
         self._licence_of = licence_of
         self._files: dict[str, FileEntry] = {}
@@ -134,6 +135,7 @@ class SourceBuilder:
                 hands=self._names("hands"),
                 objects=self._names("objects"),
                 left_out=self.left_out,
+                notes=self.notes,
             ),
         )
         return Report(self._source, sorted(self._tasks), self.defects, self.left_out)

@@ -66,6 +66,8 @@ class Manifest:
     """Objects that are complete here."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Tasks, hands or objects the source should have but lacks, with the reason."""
+    notes: dict[str, list[str]] = field(default_factory=dict)
+    """By task, what is known to differ from the benchmark's released data."""
     format: int = FORMAT
     """Layout version."""
 

