@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy_envs import TOY, PointEnv, trainer_cfg
 
 from pgdm.errors import CheckpointError, ConfigError, RunError
 from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.rl.evaluate import Evaluator, load_policy
 from pgdm.rl.trainer import Extras, Trainer
+from toy_envs import TOY, PointEnv, trainer_cfg
 
 
 class Record(Callback):
@@ -65,3 +65,226 @@ def test_ppo_brings_the_point_to_the_origin() -> None:
     assert last["eval_sampled/return"] > 2 * first["eval_sampled/return"]  # both are negative
     assert outcome.status == "finished"
     assert outcome.evaluation == last
+
+
+def test_the_same_seed_repeats_to_the_bit_and_another_does_not() -> None:
+    def trained(seed: int) -> tuple[dict[str, torch.Tensor], list[tuple]]:
+        record = Record()
+        trainer = Trainer(
+            PointEnv(), trainer_cfg(seed=seed, total_frames=1024), Extras(callbacks=[record])
+        )
+        trainer.run()
+        return weights(trainer), record.moments
+
+    first, again, other = trained(3), trained(3), trained(4)
+    assert_same(first[0], again[0])
+    assert first[1] == again[1]
+    assert not torch.equal(first[0]["policy.0.weight"], other[0]["policy.0.weight"])
+
+
+def test_evaluations_and_checkpoints_do_not_disturb_the_training(tmp_path: Path) -> None:
+    bare = Trainer(PointEnv(), trainer_cfg(total_frames=1024))
+    bare.run()
+    cfg = trainer_cfg(total_frames=1024, eval_interval_frames=256, checkpoint_interval_s=0.0)
+    busy = Trainer(
+        PointEnv(),
+        cfg,
+        Extras(
+            evaluation=evaluator(), checkpoints=CheckpointFolder(tmp_path, 2), callbacks=[Record()]
+        ),
+    )
+    busy.run()
+    assert_same(weights(bare), weights(busy))
+
+
+def test_moments_come_in_order(tmp_path: Path) -> None:
+    record = Record()
+    cfg = trainer_cfg(total_frames=1024, eval_interval_frames=512)
+    extras = Extras(
+        evaluation=evaluator(), checkpoints=CheckpointFolder(tmp_path, 2), callbacks=[record]
+    )
+    Trainer(PointEnv(), cfg, extras).run()
+    moments = [m[:2] for m in record.moments if m[0] != "checkpoint"]
+    assert moments == [
+        ("start", 0),
+        ("evaluation", 0),
+        ("iteration", 256),
+        ("iteration", 512),
+        ("evaluation", 512),
+        ("iteration", 768),
+        ("iteration", 1024),
+        ("evaluation", 1024),
+        ("end", 1024),
+    ]
+    assert record.moments[-1] == ("end", 1024, "finished")
+    files = [name for _, _, name in record.named("checkpoint")]
+    assert files[0] == "best.ckpt"  # the first evaluation is the best so far
+    assert files[-1] == "frames_000000001024.ckpt"
+
+
+def test_train_metrics_have_the_names_that_others_rely_on() -> None:
+    record = Record()
+    Trainer(PointEnv(), trainer_cfg(total_frames=1024), Extras(callbacks=[record])).run()
+    [*_, (_, _, metrics)] = record.named("iteration")
+    assert metrics.keys() >= {
+        f"train/{name}"
+        for name in (
+            *("reward", "return", "length", "success", "loss_policy", "loss_value", "entropy"),
+            *("kl", "clip_fraction", "explained_variance", "ess", "grad_norm", "action_std", "lr"),
+        )
+    }
+
+
+def test_the_last_iteration_is_completed_and_counted() -> None:
+    outcome = Trainer(PointEnv(), trainer_cfg(total_frames=700)).run()
+    assert (outcome.progress.frames, outcome.progress.iteration) == (768, 3)
+    assert outcome.progress.total_frames == 700
+    assert outcome.progress.elapsed_s > 0
+
+
+@pytest.mark.parametrize(("warm", "bias"), [(True, [0.25, -0.5]), (False, [0.0, 0.0])])
+def test_the_policys_mean_starts_at_the_warm_start(warm: bool, bias: list[float]) -> None:
+    trainer = Trainer(PointEnv(), trainer_cfg(replace(TOY, warm_start=warm)))
+    torch.testing.assert_close(trainer.model.policy[-1].bias.detach(), torch.tensor(bias))
+
+
+def test_schedules_are_applied_before_each_iteration() -> None:
+    env = PointEnv()
+    seen: list[int] = []
+
+    def ramp(frames: int) -> dict[str, float]:
+        seen.append(frames)
+        return {"near": frames / 1024}
+
+    Trainer(env, trainer_cfg(total_frames=1024), Extras(schedules=[ramp])).run()
+    assert seen == [0, 256, 512, 768]
+    assert env.weights["near"] == 0.75
+
+
+def stop_after(record: Record, iterations: int) -> Extras:
+    return Extras(callbacks=[record], stop=lambda: len(record.named("iteration")) >= iterations)
+
+
+def test_a_stop_saves_and_a_restored_training_equals_a_straight_one(tmp_path: Path) -> None:
+    cfg = trainer_cfg(total_frames=1536, eval_interval_frames=512)
+    straight_record, record = Record(), Record()
+    straight = Trainer(PointEnv(), cfg, Extras(evaluation=evaluator(), callbacks=[straight_record]))
+    whole = straight.run()
+
+    folder = CheckpointFolder(tmp_path, 2)
+    stopping = replace(stop_after(record, 2), evaluation=evaluator(), checkpoints=folder)
+    outcome = Trainer(PointEnv(), cfg, stopping).run()
+    assert outcome.status == "interrupted"
+    assert outcome.progress.iteration == 2
+    state = folder.latest()
+    assert state is not None
+    # Stopped before the evaluation that was due: it is done after the restart.
+    assert (state["frames"], state["evaluated_at"]) == (512, 0)
+
+    resumed = Trainer(
+        PointEnv(seed=99),
+        cfg,
+        Extras(evaluation=evaluator(), checkpoints=folder, callbacks=[record]),
+    )
+    resumed.load_state_dict(state)
+    end = resumed.run()
+    assert end.status == "finished"
+    assert end.evaluation == whole.evaluation
+    assert end.progress.elapsed_s > state["elapsed_s"]
+    assert_same(weights(resumed), weights(straight))
+    kinds = ("iteration", "evaluation")
+    assert record.named(*kinds) == straight_record.named(*kinds)
+
+
+def test_a_finished_training_can_be_made_longer(tmp_path: Path) -> None:
+    straight = Trainer(PointEnv(), trainer_cfg(total_frames=1024))
+    straight.run()
+    folder = CheckpointFolder(tmp_path, 2)
+    Trainer(PointEnv(), trainer_cfg(total_frames=512), Extras(checkpoints=folder)).run()
+    longer = Trainer(PointEnv(), trainer_cfg(total_frames=1024), Extras(checkpoints=folder))
+    longer.load_state_dict(folder.latest() or {})
+    assert longer.run().progress.frames == 1024
+    assert_same(weights(longer), weights(straight))
+
+
+def test_resuming_a_finished_training_does_nothing(tmp_path: Path) -> None:
+    folder, record = CheckpointFolder(tmp_path, 2), Record()
+    extras = Extras(evaluation=evaluator(), checkpoints=folder)
+    first = Trainer(PointEnv(), trainer_cfg(total_frames=512), extras).run()
+    again = Trainer(PointEnv(), trainer_cfg(total_frames=512), replace(extras, callbacks=[record]))
+    again.load_state_dict(folder.latest() or {})
+    outcome = again.run()
+    assert outcome.status == "finished"
+    assert outcome.evaluation == first.evaluation
+    assert [moment[0] for moment in record.moments] == ["start", "end"]
+
+
+def test_the_best_policy_is_kept(tmp_path: Path) -> None:
+    scores = iter([(0.1, 5.0), (0.3, 1.0), (0.3, 2.0), (0.2, 9.0), (float("nan"), 0.0)])
+
+    class Scripted:
+        def evaluate(self, policy: object, stop: object) -> dict[str, float]:
+            success, total = next(scores)
+            return {"eval_sampled/success": success, "eval_sampled/return": total}
+
+    folder, record = CheckpointFolder(tmp_path, 2), Record()
+    cfg = trainer_cfg(total_frames=1024, eval_interval_frames=1)
+    extras = Extras(evaluation=Scripted(), checkpoints=folder, callbacks=[record])
+    Trainer(PointEnv(), cfg, extras).run()
+    best = [frames for _, frames, name in record.named("checkpoint") if name == "best.ckpt"]
+    assert best == [0, 256, 512]
+    policy = load_policy(folder.best)
+    assert policy.cfg.hidden == TOY.hidden
+
+
+def test_the_metadata_is_in_the_checkpoint(tmp_path: Path) -> None:
+    folder = CheckpointFolder(tmp_path, 2)
+    extras = Extras(checkpoints=folder, metadata={"task": "point", "numbers": [1, 2.5]})
+    Trainer(PointEnv(), trainer_cfg(total_frames=256), extras).run()
+    state = folder.latest()
+    assert state is not None
+    assert state["metadata"] == {"task": "point", "numbers": [1, 2.5]}
+
+
+def test_checkpoints_are_written_by_time(tmp_path: Path) -> None:
+    record = Record()
+    cfg = trainer_cfg(total_frames=1024, checkpoint_interval_s=0.0)
+    extras = Extras(checkpoints=CheckpointFolder(tmp_path, 2), callbacks=[record])
+    Trainer(PointEnv(), cfg, extras).run()
+    assert [frames for _, frames, _ in record.named("checkpoint")] == [0, 256, 512, 768, 1024]
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_nan_ends_the_training_and_leaves_a_good_checkpoint(tmp_path: Path) -> None:
+    record = Record()
+    env = PointEnv()
+    folder = CheckpointFolder(tmp_path, 2)
+
+    def poison(frames: int) -> dict[str, float]:
+        return {"near": float("nan") if frames >= 512 else 1.0}
+
+    cfg = trainer_cfg(total_frames=1024, checkpoint_interval_s=0.0)
+    extras = Extras(checkpoints=folder, schedules=[poison], callbacks=[record])
+    with pytest.raises(RunError, match="reward term 'near' is nan in simulation 0 at step 0"):
+        Trainer(env, cfg, extras).run()
+    assert record.moments[-1] == ("end", 512, "failed")
+    state = folder.latest()
+    assert state is not None
+    assert state["frames"] == 512
+    assert all(torch.isfinite(value).all() for value in state["learner"]["model"].values())
+
+
+def test_a_checkpoint_of_another_network_is_refused() -> None:
+    state = Trainer(PointEnv(), trainer_cfg()).state_dict()
+    other = Trainer(PointEnv(), trainer_cfg(replace(TOY, hidden=[16])))
+    with pytest.raises(CheckpointError, match=r"hidden is \[32, 32\] there and \[16\] here"):
+        other.load_state_dict(state)
+    same = Trainer(PointEnv(), trainer_cfg())
+    del state["frames"]
+    with pytest.raises(CheckpointError, match="does not fit"):
+        same.load_state_dict(state)
+
+
+def test_uneven_minibatches_are_refused_at_construction() -> None:
+    with pytest.raises(ConfigError, match="does not divide"):
+        Trainer(PointEnv(7), trainer_cfg())

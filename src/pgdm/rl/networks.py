@@ -82,8 +82,10 @@ class ActorCritic(nn.Module):
             _initialise(self.policy, _MEAN_GAIN, generator)
             _initialise(self.critic, _VALUE_GAIN, generator)
         if mean_bias is not None:
+            last = self.policy[-1]
+            assert isinstance(last, nn.Linear)
             with torch.no_grad():
-                self.policy[-1].bias.copy_(mean_bias)
+                last.bias.copy_(mean_bias)
 
     @property
     def device(self) -> torch.device:
@@ -145,8 +147,7 @@ def _mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
 
 def _linear(inputs: int, outputs: int) -> nn.Linear:
     # skip_init: torch's own start values would draw from the global stream.
-    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
-    return layer  # pyright: ignore[reportReturnType]
+    return nn.utils.skip_init(nn.Linear, inputs, outputs)
 
 
 def _initialise(net: nn.Sequential, last_gain: float, generator: torch.Generator) -> None:

@@ -1,0 +1,129 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from pgdm.errors import CheckpointError
+from pgdm.rl.checkpoint import CheckpointFolder, write_checkpoint
+from pgdm.rl.evaluate import Evaluator, load_policy, run_episodes, summarise
+from pgdm.rl.trainer import Extras, Trainer
+from pgdm.seeding import torch_stream
+from toy_envs import TOY, PointEnv, trainer_cfg
+
+
+class Still:
+    """A policy that does nothing."""
+
+    def act(
+        self, obs: Tensor, generator: torch.Generator | None = None, deterministic: bool = False
+    ) -> Tensor:
+        return torch.zeros(len(obs), 2)
+
+
+class Noisy(Still):
+    def act(
+        self, obs: Tensor, generator: torch.Generator | None = None, deterministic: bool = False
+    ) -> Tensor:
+        if deterministic:
+            return torch.zeros(len(obs), 2)
+        return torch.randn(len(obs), 2, generator=generator)
+
+
+class LadderEnv(PointEnv):
+    """Simulation i's episodes take i + 1 steps; success is how many it has finished by then."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs)
+        self.ladder, self.finished = torch.arange(num_envs) + 1, torch.zeros(num_envs)
+
+    def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        self._t = self._t + 1
+        done = self._t >= self.ladder
+        self.finished += done
+        episodes = {"length": self._t[done], "finished": self.finished[done]} if done.any() else {}
+        info = {"final_obs": self._obs(), "episodes": episodes, "terms": {}}
+        self._t = self._t.masked_fill(done, 0)
+        never = torch.zeros_like(done)
+        return self._obs(), torch.zeros(self.num_envs), done, never, info
+
+
+def test_only_the_first_episode_of_each_simulation_counts() -> None:
+    results = run_episodes(LadderEnv(5), Still(), None)
+    assert results is not None
+    assert results["length"].tolist() == [1, 2, 3, 4, 5]
+    assert results["finished"].tolist() == [1, 1, 1, 1, 1]
+
+
+def test_means_and_spreads() -> None:
+    summary = summarise({"length": torch.tensor([1.0, 2, 3]), "one": torch.tensor([4.0])}, "a/")
+    assert summary == {"a/length": 2.0, "a/length_std": 1.0, "a/one": 4.0}
+
+
+def test_names_of_sampled_and_deterministic() -> None:
+    metrics = Evaluator(lambda n: PointEnv(n, seed=1), 3, 1, seed=0).evaluate(Noisy())
+    assert metrics is not None
+    assert {"eval_sampled/return", "eval_sampled/return_std"} <= metrics.keys()
+    assert "eval_deterministic/return" in metrics
+    assert "eval_deterministic/return_std" not in metrics  # of one episode there is none
+
+
+def test_repeats_to_the_bit_and_leaves_every_other_stream_alone() -> None:
+    evaluator = Evaluator(lambda n: PointEnv(n, seed=1), 8, 2, seed=0)
+    before = torch.random.get_rng_state()
+    first = evaluator.evaluate(Noisy())
+    assert evaluator.evaluate(Noisy()) == first
+    assert Evaluator(lambda n: PointEnv(n, seed=1), 8, 2, seed=0).evaluate(Noisy()) == first
+    assert Evaluator(lambda n: PointEnv(n, seed=1), 8, 2, seed=1).evaluate(Noisy()) != first
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_environments_are_built_once() -> None:
+    built: list[int] = []
+
+    def make(n: int) -> PointEnv:
+        built.append(n)
+        return PointEnv(n)
+
+    evaluator = Evaluator(make, 8, 2, seed=0)
+    evaluator.evaluate(Still())
+    evaluator.evaluate(Still())
+    assert built == [8, 2]
+
+
+def test_a_stop_gives_up_between_steps() -> None:
+    asked: list[int] = []
+
+    def stop() -> bool:
+        asked.append(1)
+        return len(asked) > 3
+
+    evaluator = Evaluator(lambda n: PointEnv(n), 4, 1, seed=0)
+    assert evaluator.evaluate(Still(), stop) is None
+    assert len(asked) == 4
+    assert evaluator.evaluate(Still()) is not None
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_a_loaded_policy_acts_like_the_trained_one(tmp_path: Path, normalize: bool) -> None:
+    cfg = trainer_cfg(replace(TOY, normalize_observations=normalize), total_frames=512)
+    trainer = Trainer(PointEnv(scale=30.0), cfg, Extras(checkpoints=CheckpointFolder(tmp_path, 1)))
+    trainer.run()
+    [path] = CheckpointFolder(tmp_path, 1).all()
+    policy = load_policy(path)
+    obs = 30 * torch.randn(4, 5, generator=torch_stream(0, "test"))
+    mean = trainer.model.act(obs, deterministic=True)
+    assert torch.equal(policy.act(obs, deterministic=True), mean)
+    sample = trainer.model.act(obs, torch_stream(1, "a"))
+    assert torch.equal(policy.act(obs, torch_stream(1, "a")), sample)
+    assert (policy.normalizer is not None) == normalize
+
+
+def test_a_checkpoint_without_a_policy_is_refused(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path / "a.ckpt", {"network": {"obs_dim": 3}})
+    with pytest.raises(CheckpointError, match="holds no policy"):
+        load_policy(tmp_path / "a.ckpt")

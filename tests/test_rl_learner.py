@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from pgdm.errors import ConfigError, RunError
+from pgdm.rl import learner as learner_module
+from pgdm.rl.collector import Collector, Rollout
+from pgdm.rl.learner import Learner, PPOCfg, check_batch, explained_variance
+from pgdm.rl.loss import Minibatch
+from pgdm.rl.networks import ActorCritic, NetworkCfg
+from pgdm.rl.vec_env import VecEnv
+from pgdm.seeding import torch_stream
+from toy_envs import PAPER, TOY, PointEnv, ScriptedEnv
+
+
+def build(env: VecEnv, cfg: PPOCfg) -> tuple[Learner, Collector]:
+    network = NetworkCfg(
+        env.obs_dim, env.action_dim, cfg.hidden, cfg.log_std_init, cfg.normalize_observations, 10.0
+    )
+    model = ActorCritic(network, torch_stream(0, "weights"))
+    collector = Collector(env, model, cfg.steps_per_env, torch_stream(0, "actions"))
+    collector.reset()
+    return Learner(model, cfg, torch_stream(0, "minibatches"), 1), collector
+
+
+def test_each_sample_is_visited_once_in_each_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner, collector = build(PointEnv(8), TOY)
+    visited: list[torch.Tensor] = []
+    real = learner_module.ppo_loss
+
+    def watch(*args: Any, **settings: Any) -> Any:
+        visited.append(args[3].obs)
+        return real(*args, **settings)
+
+    monkeypatch.setattr(learner_module, "ppo_loss", watch)
+    rollout = collector.collect()
+    learner.learn(rollout)
+    samples = rollout.obs[:-1].flatten(0, 1)
+    per_epoch = len(samples) // TOY.minibatch_size
+    assert len(visited) == TOY.epochs * per_epoch
+    orders = [torch.cat(visited[i : i + per_epoch]) for i in range(0, len(visited), per_epoch)]
+    for order in orders:
+        assert sorted(order.tolist()) == sorted(samples.tolist())
+    assert not torch.equal(orders[0], orders[1])
+
+
+def test_the_visiting_order_comes_from_the_named_stream() -> None:
+    learner, _ = build(PointEnv(8), TOY)
+    expected = torch.randperm(256, generator=torch_stream(0, "minibatches"))
+    assert torch.equal(torch.cat(learner._minibatches(256)), expected)
+
+
+def test_values_stand_for_what_was_cut_but_not_for_what_ended() -> None:
+    """With a critic that answers its observation, gamma 0.5 and lambda 0: target = r + g * V'."""
+    cfg = replace(TOY, gamma=0.5, gae_lambda=0.0, steps_per_env=3, minibatch_size=6)
+    ends, cuts = torch.zeros(3, 2, dtype=torch.bool), torch.zeros(3, 2, dtype=torch.bool)
+    ends[1, 0], cuts[1, 1] = True, True
+    learner, collector = build(ScriptedEnv(torch.ones(3, 2), ends, cuts), cfg)
+    learner.model.value = lambda obs: obs[..., 0]  # type: ignore[method-assign]
+    batch, _ = learner._prepare(collector.collect())
+    # The observation after step t is t + 1, of restarted rows its negative (never to be used).
+    ended, cut = batch.target.reshape(3, 2).T
+    assert ended.tolist() == [1 + 0.5 * 1, 1, 1 + 0.5 * 3]
+    assert cut.tolist() == [1 + 0.5 * 1, 1 + 0.5 * 2, 1 + 0.5 * 3]
+
+
+def test_all_of_an_iteration_sees_the_same_statistics() -> None:
+    cfg = replace(TOY, normalize_observations=True)
+    learner, collector = build(PointEnv(8, scale=30.0), cfg)
+    normalizer = learner.model.normalizer
+    assert normalizer is not None
+    first = collector.collect()
+    batch, _ = learner._prepare(first)
+    torch.testing.assert_close(batch.obs, first.obs[:-1].flatten(0, 1).clamp(-10, 10))
+    metrics = learner.learn(first)
+    assert float(normalizer.count) == 256
+    second = collector.collect()
+    seen = second.obs[:-1].flatten(0, 1)
+    torch.testing.assert_close(learner._prepare(second)[0].obs, normalizer(seen))
+    # The policy that acted and the one that learns agree: the ratios of the first step are 1.
+    terms = learner._update(Minibatch(*(c[:64] for c in learner._prepare(second)[0])))
+    kl, clipped = float(terms[3]), float(terms[4])
+    assert kl == pytest.approx(0, abs=1e-6)
+    assert clipped == 0
+    assert math.isfinite(metrics["loss_policy"])
+
+
+def test_logged_numbers() -> None:
+    learner, collector = build(PointEnv(8), TOY)
+    metrics = learner.learn(collector.collect())
+    assert set(metrics) == {
+        *("loss_policy", "loss_value", "entropy", "kl", "clip_fraction", "ess", "grad_norm"),
+        *("explained_variance", "action_std", "lr"),
+    }
+    assert metrics["lr"] == TOY.learning_rate
+    assert metrics["action_std"] == pytest.approx(math.exp(-1), rel=0.1)
+    assert 0 < metrics["ess"] <= 1
+
+
+def test_gradients_are_scaled_down_to_the_norm() -> None:
+    cfg = replace(TOY, max_grad_norm=1e-3)
+    learner, collector = build(PointEnv(8), cfg)
+    batch, _ = learner._prepare(collector.collect())
+    stats = learner._update(batch)
+    assert float(stats[-1]) > 1e-3  # the norm before, as it is logged
+    grads = torch.cat([p.grad.flatten() for p in learner.model.parameters() if p.grad is not None])
+    assert float(grads.norm()) == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_a_loss_that_is_not_finite_is_named_and_changes_nothing() -> None:
+    learner, collector = build(PointEnv(8), TOY)
+    rollout = collector.collect()
+    rollout.log_prob[:] = -math.inf  # ratios become infinite
+    before = {name: value.clone() for name, value in learner.model.state_dict().items()}
+    with pytest.raises(RunError, match=r"^loss_policy is not finite .*last checkpoint is good"):
+        learner.learn(rollout)
+    after = learner.model.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_a_value_loss_that_is_not_finite_is_named() -> None:
+    learner, collector = build(PointEnv(8), TOY)
+    rollout: Rollout = collector.collect()
+    rollout.reward[3, 2] = math.inf
+    with pytest.raises(RunError, match=r"loss_value inf|loss_policy is not finite"):
+        learner.learn(rollout)
+
+
+def test_explained_variance() -> None:
+    target = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    assert explained_variance(target, target) == 1
+    assert explained_variance(torch.full((4,), 2.5), target) == 0
+    # Errors 1, -1, 1, -1 have variance 1, the target has 1.25.
+    assert explained_variance(torch.tensor([0.0, 3, 2, 5]), target) == pytest.approx(1 - 1 / 1.25)
+    assert math.isnan(explained_variance(target, torch.ones(4)))
+
+
+def test_uneven_minibatches_are_refused_with_the_sizes() -> None:
+    check_batch(PAPER, 32)
+    with pytest.raises(ConfigError, match=r"256 does not divide the 3968 samples.*num_envs 31"):
+        check_batch(PAPER, 31)
+    with pytest.raises(ConfigError, match="does not divide the 128"):
+        check_batch(PAPER, 1)

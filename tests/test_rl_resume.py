@@ -1,0 +1,145 @@
+"""A training that is killed and resumed equals one that never stopped, to the bit."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import random
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from multiprocessing.context import ForkServerContext
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from pgdm.rl.callback import Callback, Progress
+from pgdm.rl.checkpoint import CheckpointFolder
+from pgdm.rl.evaluate import Evaluator
+from pgdm.rl.trainer import Extras, Trainer
+from toy_envs import TOY, PointEnv, trainer_cfg
+
+ITERATIONS = 12
+PAUSE_S = 0.06
+"""Added to each iteration, so that three kills surely fall before the end."""
+# Wide enough that torch really splits the work over its threads.
+ALGO = replace(TOY, steps_per_env=64, minibatch_size=256, epochs=1, hidden=[256, 128])
+FRAMES = 8 * ALGO.steps_per_env
+
+
+class Lines(Callback):
+    """Appends all metrics to a file, times aside, and takes its time."""
+
+    def __init__(self, path: Path, pause_s: float) -> None:
+        self._path, self._pause_s = path, pause_s
+
+    def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
+        time.sleep(self._pause_s)
+        self._write("train", progress, metrics)
+
+    def on_evaluation(self, progress: Progress, metrics: dict[str, float]) -> None:
+        self._write("eval", progress, metrics)
+
+    def _write(self, kind: str, progress: Progress, metrics: dict[str, float]) -> None:
+        kept = {name: value.hex() for name, value in metrics.items() if "steps_per_s" not in name}
+        with self._path.open("a") as file:
+            file.write(json.dumps([kind, progress.frames, progress.iteration, kept]) + "\n")
+
+
+def train(folder: Path, threads: int, normalize: bool, pause_s: float) -> None:
+    """Start or resume the training in a folder; runs in a process of its own."""
+    cfg = trainer_cfg(
+        replace(ALGO, normalize_observations=normalize),
+        total_frames=ITERATIONS * FRAMES,
+        eval_interval_frames=3 * FRAMES,
+        checkpoint_interval_s=0.0,
+        num_threads=threads,
+    )
+    checkpoints = CheckpointFolder(folder, 2)
+    extras = Extras(
+        evaluation=Evaluator(lambda n: PointEnv(n, seed=1), 4, 1, seed=3),
+        checkpoints=checkpoints,
+        callbacks=[Lines(folder / "lines", pause_s)],
+    )
+    trainer = Trainer(PointEnv(scale=30.0), cfg, extras)
+    state = checkpoints.latest()
+    if state is not None:
+        trainer.load_state_dict(state)
+    trainer.run()
+    (folder / "done").touch()
+
+
+def lines(folder: Path) -> dict[tuple[str, int], Any]:
+    """Return what was logged; what was logged twice must be the same twice."""
+    logged: dict[tuple[str, int], Any] = {}
+    for line in (folder / "lines").read_text().splitlines():
+        try:
+            kind, frames, iteration, metrics = json.loads(line)
+        except ValueError:
+            continue  # cut off by a kill
+        entry = logged.setdefault((kind, frames), (iteration, metrics))
+        assert entry == (iteration, metrics)
+    return logged
+
+
+@pytest.fixture(scope="module")
+def processes() -> Iterator[ForkServerContext]:
+    """A server that has imported everything: starting a training costs milliseconds."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["test_rl_resume", "torchrl.objectives.value.functional"])
+    yield context
+
+
+def run(context: ForkServerContext, *args: Any) -> Any:
+    process = context.Process(target=train, args=args)
+    process.start()
+    return process
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_killed_three_times_equals_never_stopped(
+    processes: ForkServerContext, tmp_path: Path, threads: int, normalize: bool
+) -> None:
+    straight, killed = tmp_path / "straight", tmp_path / "killed"
+    for folder in (straight, killed):
+        folder.mkdir()
+    process = run(processes, straight, threads, normalize, 0.0)
+    process.join()
+    assert process.exitcode == 0
+
+    hits = 0
+    for _ in range(3):
+        process = run(processes, killed, threads, normalize, PAUSE_S)
+        deadline = time.monotonic() + random.uniform(0.05, ITERATIONS * PAUSE_S / 3)
+        while time.monotonic() < deadline and process.is_alive():
+            time.sleep(0.005)
+        hits += process.is_alive()
+        process.kill()
+        process.join()
+    assert hits == 3, "the training ended before it could be killed"
+    process = run(processes, killed, threads, normalize, 0.0)
+    process.join()
+    assert process.exitcode == 0
+
+    last, other = (CheckpointFolder(folder, 2).latest() for folder in (straight, killed))
+    assert last is not None and other is not None
+    assert last["frames"] == ITERATIONS * FRAMES
+    for state in (last, other):
+        state.pop("elapsed_s")
+    assert flat(other) == flat(last)
+    assert lines(killed) == lines(straight)
+    assert len(lines(straight)) == ITERATIONS + 5
+
+
+def flat(state: Any) -> Any:
+    """Return a state with its tensors as comparable values."""
+    if isinstance(state, torch.Tensor):
+        return (state.dtype, tuple(state.shape), state.numpy().tobytes())
+    if isinstance(state, dict):
+        return {name: flat(value) for name, value in state.items()}
+    if isinstance(state, list | tuple):
+        return [flat(value) for value in state]
+    return state
