@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
@@ -33,8 +34,8 @@ class _Column:
 
 
 _ROWS = (
-    _Row("success", "success (within 1 cm)", ".1%", "paper_success"),
-    _Row("com_error_released", "COM error, released form [m]", ".2e", "paper_com_error"),
+    _Row("success", "success, within 1 cm", ".1%", "paper_success"),
+    _Row("com_error_released", "COM error, released [m]", ".2e", "paper_com_error"),
     _Row("com_error", "COM error, mean [m]", ".4f"),
     _Row("ori_error", "rotation error [rad]", ".3f"),
     _Row("lifted", "lifted", ".1%"),
@@ -50,7 +51,7 @@ def summary_table(cfg: ExperimentCfg, result: RunResult) -> Table:
     columns = [
         _Column("before", result.before, "eval_sampled/"),
         _Column(f"after\n{frames:,} frames", result.after, "eval_sampled/"),
-        _Column("after\ndeterministic", result.after, "eval_deterministic/"),
+        _Column("the same,\nno noise", result.after, "eval_deterministic/"),
     ]
     return _table(cfg, columns, _caption(cfg, frames))
 
@@ -72,13 +73,13 @@ def metrics_table(
 
 def _table(cfg: ExperimentCfg, columns: Sequence[_Column], caption: str) -> Table:
     table = Table(title=_title(cfg), caption=caption)
-    table.add_column("metric")
-    for head in [*(column.head for column in columns), f"paper\n{PAPER_FRAMES:,} frames"]:
-        table.add_column(head, justify="right")
+    table.add_column("metric", no_wrap=True)
+    for head in [*(column.head for column in columns), f"paper\n{PAPER_FRAMES / 1e6:.0f}M frames"]:
+        table.add_column(head, justify="right", no_wrap=True)
     for row in _ROWS:
         paper = getattr(cfg.task, row.paper) if row.paper else None
         table.add_row(
-            row.label,
+            escape(row.label),
             *(_shown(column.metrics, f"{column.prefix}{row.name}", row.form) for column in columns),
             "" if paper is None else format(paper, row.form),
         )
@@ -102,7 +103,7 @@ def _caption(cfg: ExperimentCfg, frames: int) -> str:
     differs = [
         text
         for text, there in (
-            (f"{frames / PAPER_FRAMES:.1%} of the paper's frames", frames < PAPER_FRAMES),
+            (f"{frames:,} of {PAPER_FRAMES:,} frames", frames < PAPER_FRAMES),
             (f"action={cfg.action.kind}", cfg.action.kind != "absolute"),
             (f"algo={cfg.algo.name}", cfg.algo.name != "ppo"),
             (f"obs={cfg.obs.layout}", cfg.obs.layout != "released"),
