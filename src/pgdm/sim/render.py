@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -21,6 +22,7 @@ GHOST_RGBA = np.array([0.15, 0.95, 0.45, 0.35], np.float32)
 # Software OpenGL: a frame of 640x480 costs about 75 ms with these, 230 ms with the scene's own.
 SHADOW_SIZE = 1024
 SAMPLES = 4
+SHADOW_SCALE = 0.1  # of the lamp's cone: its shadows need not reach beyond the table
 VIDEO_FPS = 25  # control steps a second (SPEC 1): films run at the speed of the task
 
 
@@ -56,7 +58,8 @@ class Renderer:
         self._scene = mujoco.MjvScene(model, MAX_GEOMS)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._option = mujoco.MjvOption()
-        self._camera = camera_for(model, motion, width / height)
+        mujoco.mj_kinematics(model, self._data)
+        self._camera = camera_for(model, self._data, object_body, motion, width / height)
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._gl, self._mjr = _open(model, width, height)
         self._free = weakref.finalize(self, _close, self._gl, self._mjr)
@@ -149,6 +152,7 @@ class Renderer:
             pos = goal_pos + turn @ (geom.pos - start)
             mat = (turn @ geom.mat).ravel()
             mujoco.mjv_initGeom(ghost, geom.type, geom.size, pos, mat, GHOST_RGBA)
+            ghost.size[:] = geom.size  # already in the scene's form, which initGeom would redo
             ghost.dataid = geom.dataid
             ghost.category = mujoco.mjtCatBit.mjCAT_DECOR
             self._scene.ngeom += 1
@@ -161,19 +165,30 @@ def _open(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.M
         context.make_current()
     except (ImportError, RuntimeError, AttributeError, OSError) as error:
         raise RenderError(f"OpenGL does not start: {error}") from error
-    glob, quality = model.vis.global_, model.vis.quality
-    before = glob.offwidth, glob.offheight, quality.offsamples, quality.shadowsize
-    # The scene's own off-screen buffer is 3024x1680 with 8 samples: 300 MB in software OpenGL.
-    glob.offwidth, glob.offheight = width, height
-    quality.offsamples, quality.shadowsize = SAMPLES, SHADOW_SIZE
-    try:
-        resources = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    except mujoco.FatalError as error:
-        raise RenderError(f"OpenGL does not start: {error}") from error
-    finally:
-        glob.offwidth, glob.offheight, quality.offsamples, quality.shadowsize = before
+    with _drawn_cheaply(model, width, height):
+        try:
+            resources = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except mujoco.FatalError as error:
+            raise RenderError(f"OpenGL does not start: {error}") from error
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, resources)
     return context, resources
+
+
+@contextlib.contextmanager
+def _drawn_cheaply(model: mujoco.MjModel, width: int, height: int) -> Iterator[None]:
+    """Give a model our settings while MuJoCo reads them; physics does not know them.
+
+    The scene's own off-screen buffer is 3024x1680 with 8 samples: 300 MB in software OpenGL.
+    """
+    glob, quality, maps = model.vis.global_, model.vis.quality, model.vis.map
+    before = glob.offwidth, glob.offheight, quality.offsamples, quality.shadowsize, maps.shadowscale
+    glob.offwidth, glob.offheight = width, height
+    quality.offsamples, quality.shadowsize, maps.shadowscale = SAMPLES, SHADOW_SIZE, SHADOW_SCALE
+    try:
+        yield
+    finally:
+        glob.offwidth, glob.offheight, quality.offsamples, quality.shadowsize = before[:4]
+        maps.shadowscale = before[4]
 
 
 def _close(context: Any, resources: mujoco.MjrContext) -> None:
