@@ -27,14 +27,16 @@ class Library:
         folders: folder of each source.
     """
 
-    def __init__(
-        self, root: Path, sources: dict[str, Manifest], folders: dict[str, Path]
-    ) -> None:
+    def __init__(self, root: Path, sources: dict[str, Manifest], folders: dict[str, Path]) -> None:
         self.root, self._sources, self._folders = root, sources, folders
 
     def sources(self) -> dict[str, Manifest]:
         """Return the manifest of each source that is present, the winning one first."""
         return dict(self._sources)
+
+    def folder(self, source: str) -> Path:
+        """Return the folder of a source that is present."""
+        return self._folders[source]
 
     def tasks(self) -> dict[str, str]:
         """Return the source that serves each task, by task id."""
@@ -108,16 +110,14 @@ class Library:
         Raises:
             LibraryError: the library is empty.
         """
-        found = self._serving("scene", "table", source, dict.fromkeys(self._sources, ["table"]))
+        found = self._serving("scene", "table", source, {s: ["table"] for s in self._sources})
         return self._existing(found, "scene/table.xml")
 
     def _source(self, task: str, source: str | None) -> str:
         have = {s: list(m.tasks) for s, m in self._sources.items()}
         return self._serving("task", task, source, have)
 
-    def _serving(
-        self, kind: str, name: str, source: str | None, have: dict[str, list[str]]
-    ) -> str:
+    def _serving(self, kind: str, name: str, source: str | None, have: dict[str, list[str]]) -> str:
         if not have:
             raise LibraryError(f"the asset library in {self.root} is empty. {CURE}")
         if source is not None and source not in have:

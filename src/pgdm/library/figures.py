@@ -8,7 +8,7 @@ Lengths in m, angles in rad, masses in kg, gains in N/m and Nm/rad.
 
 from __future__ import annotations
 
-GRAB_TASKS = (
+_GRAB_TASKS = (
     "airplane-fly1 airplane-pass1 alarmclock-lift alarmclock-see1 banana-pass1 binoculars-pass1 "
     "cup-drink1 cup-pour1 duck-inspect1 duck-lift elephant-pass1 eyeglasses-pass1 flashlight-lift "
     "flashlight-on2 flute-pass1 fryingpan-cook2 hammer-use1 hand-inspect1 headphones-pass1 "
@@ -16,7 +16,8 @@ GRAB_TASKS = (
     "spheremedium-lift stamp-stamp1 stanfordbunny-inspect1 stapler-lift toothbrush-lift "
     "toothpaste-lift toruslarge-inspect1 train-play1 watch-lift waterbottle-lift "
     "waterbottle-shake1 wineglass-drink1 wineglass-drink2 wineglass-toast1"
-).split()
+)
+GRAB_TASKS = tuple(_GRAB_TASKS.split())
 """The motion-capture tasks, which the package can serve."""
 
 SUBSTEPS = 10

