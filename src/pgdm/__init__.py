@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pgdm.make import register
+
 if TYPE_CHECKING:
     from pgdm.make import make_batch, make_torchrl
 
@@ -21,3 +23,7 @@ def __getattr__(name: str) -> object:
 
         return getattr(make, name)
     raise AttributeError(f"module 'pgdm' has no attribute '{name}'")
+
+
+# Gymnasium finds environments of packages that were imported; it asks for nothing by itself.
+register()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
     from pgdm.envs.batch_env import BatchEnv
     from pgdm.envs.gym import PgdmEnv
     from pgdm.envs.torchrl import PgdmTorchRLEnv
+
+_log = logging.getLogger(__name__)
 
 _GROUPS = ("pregrasp", "obs", "action", "method", "ablation", "hand", "sim")
 
@@ -60,7 +63,7 @@ def make_batch(
 
     chosen = [f"{group}={option}" for group, option in choices.items()]
     cfg = compose([f"task={task}", *chosen, *overrides])
-    builder = env_builder(cfg, ensure(cfg.task.motion, offline))
+    builder = env_builder(cfg, ensure(cfg.task.motion, offline, _log.warning))
     return builder.make(num_envs, num_threads, seed, auto_reset)
 
 
@@ -83,7 +86,7 @@ def make_gym(task: str, *, render_mode: str | None = None, **kwargs: Any) -> Pgd
 
 
 def register() -> None:
-    """Tell Gymnasium of all tasks; it calls this itself when it is imported."""
+    """Tell Gymnasium of all tasks, as ``pgdm/<task>-v0``."""
     import gymnasium
 
     for task in available("task"):

@@ -73,10 +73,6 @@ class SimBatch:
         """Return one simulation's MjData, a copy that its next call writes over."""
         return self._batch.get_data(sim, self._scratch)
 
-    def model(self, sim: int) -> mujoco.MjModel:
-        """Return one simulation's model, with what varies between simulations; a copy."""
-        return self._batch.get_model(sim)
-
     def reset(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Restart simulations ids (k,) from qpos (nq,) and qvel (nv,)."""
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
@@ -144,10 +140,20 @@ class SimBatch:
         self.rows[:] = rows
         self._batch.forward(stage=_CURRENT)
 
+    def contact(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return friction (N, 3) and half-width (N,) m of the randomised geom."""
+        geom = self._randomized_geom()
+        friction, size = self._batch.expand("geom_friction"), self._batch.expand("geom_size")
+        return friction[:, geom].copy(), size[:, geom, 0].copy()
+
     def set_contact(self, ids: np.ndarray, friction: np.ndarray, half_width: np.ndarray) -> None:
         """Set friction (k, 3) and half-width (k,) m of the randomised geom in simulations ids."""
+        geom = self._randomized_geom()
+        self._batch.expand("geom_friction")[ids, geom] = friction
+        self._batch.expand("geom_size")[ids, geom, 0] = half_width
+
+    def _randomized_geom(self) -> int:
         geom = self.scene.index.randomized_geom
         if geom is None:
             raise SceneError(f"task '{self.scene.task.id}' has no geom to randomise")
-        self._batch.expand("geom_friction")[ids, geom] = friction
-        self._batch.expand("geom_size")[ids, geom, 0] = half_width
+        return geom
