@@ -34,7 +34,7 @@ def test_every_task_resets_steps_and_renders(task: str) -> None:
     env = pgdm.make_batch(task, num_envs=2, num_threads=1)
     first = env.reset().clone()
     for action in noise(env, 3):
-        obs, reward, terminated, truncated, info = env.step(action)
+        obs, reward, _, truncated, info = env.step(action)
     assert obs.shape == (2, env.obs_dim) and obs.dtype == torch.float32
     assert torch.isfinite(obs).all() and torch.isfinite(reward).all()
     assert (reward >= 0).all() and (reward <= 12.5).all()
