@@ -218,8 +218,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = VIDEO_FPS) 
     if not pictures:
         raise RenderError(f"no frames for {path}")
     height, width = pictures[0].shape[:2]
-    temp = path.with_name(f".{os.getpid()}.{path.name}")
-    try:
+    with _replacing(path) as temp:
         path.parent.mkdir(parents=True, exist_ok=True)
         writer = imageio_ffmpeg.write_frames(
             str(temp),
@@ -231,15 +230,10 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = VIDEO_FPS) 
             output_params=["-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"],
             ffmpeg_log_level="error",
         )
-        writer.send(None)
-        for picture in pictures:
-            writer.send(picture)
-        writer.close()
-        os.replace(temp, path)
-    except (OSError, RuntimeError) as error:
-        raise RenderError(f"cannot write {path}: {error}") from error
-    finally:
-        temp.unlink(missing_ok=True)
+        with contextlib.closing(writer):
+            writer.send(None)
+            for picture in pictures:
+                writer.send(picture)
     return write_image(path.with_suffix(".png"), pictures[len(pictures) // 2])
 
 
@@ -251,15 +245,23 @@ def write_image(path: Path, picture: np.ndarray) -> Path:
     """
     from PIL import Image
 
+    with _replacing(path) as temp:
+        Image.fromarray(picture).save(temp, format="png")
+    return path
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Give a name to write to; what was written takes the place of ``path`` in one step."""
     temp = path.with_name(f".{os.getpid()}.{path.name}")
     try:
-        Image.fromarray(picture).save(temp, format="png")
+        yield temp
         os.replace(temp, path)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
         raise RenderError(f"cannot write {path}: {error}") from error
     finally:
-        temp.unlink(missing_ok=True)
-    return path
+        with contextlib.suppress(OSError):
+            temp.unlink()
 
 
 def _even(frame: np.ndarray) -> np.ndarray:
