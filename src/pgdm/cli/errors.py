@@ -6,7 +6,7 @@ import errno
 import os
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
 
@@ -71,18 +71,36 @@ def exit_code(error: BaseException) -> int:
 
 def report(error: BaseException, debug: bool) -> int:
     """Print an error to stderr, its traceback only for ``debug``, and return the exit code."""
+    if isinstance(error, BrokenPipeError):
+        return FAILED  # who read our output has gone, as ``head`` does
     if debug:
         traceback.print_exception(error)
-    try:
-        print(f"error: {message(error)}", file=sys.stderr, flush=True)
-    except OSError:
-        # Nobody reads stderr any more (closed pipe, full disk): the exit code has to do.
-        sys.stderr = open(os.devnull, "w")  # noqa: SIM115 (open until the process ends)
+    print(f"error: {message(error)}", file=sys.stderr, flush=True)
     return exit_code(error)
 
 
+def guarded(command: Callable[[], int], debug: bool) -> int:
+    """Run a command and return its exit code; errors become one line on stderr."""
+    with _one_line(debug):
+        try:
+            return _flushed(command())
+        except EXPECTED as error:
+            return report(error, debug)
+
+
+def _flushed(code: int) -> int:
+    """Write out what was printed, while an error can still be told."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        # The interpreter would try again when it ends, and complain in its own words.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise
+    return code
+
+
 @contextmanager
-def one_line(debug: bool) -> Iterator[None]:
+def _one_line(debug: bool) -> Iterator[None]:
     """Show also an error that nobody expected as one line, while inside.
 
     It uses the interpreter's hook, and catches nothing: what goes wrong still ends the process.

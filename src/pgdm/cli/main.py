@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from pgdm.cli import assets, dashboard, runs
-from pgdm.cli.errors import EXPECTED, USAGE, one_line, report
+from pgdm.cli.errors import USAGE, guarded, report
 from pgdm.errors import ConfigError
 
 # click's ClickException, which typer brings as a copy of its own in newer versions.
@@ -34,21 +34,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
-    with one_line(debug):
-        try:
-            from pgdm.cli.run import set_up_logging
+    return guarded(lambda: _main(arguments, debug), debug)
 
-            set_up_logging(debug)
-            code = typer.main.get_command(app).main(
-                arguments, prog_name="pgdm", standalone_mode=False
-            )
-            return code if isinstance(code, int) else 0
-        except _WRONG_USAGE as error:
-            return _report_usage(error, debug)
-        except typer.Abort:
-            return report(KeyboardInterrupt(), debug)
-        except EXPECTED as error:
-            return report(error, debug)
+
+def _main(arguments: list[str], debug: bool) -> int:
+    from pgdm.cli.run import set_up_logging
+
+    set_up_logging(debug)
+    command = typer.main.get_command(app)
+    try:
+        code = command.main(arguments, prog_name="pgdm", standalone_mode=False)
+    except _WRONG_USAGE as error:
+        return _report_usage(error, debug)
+    except typer.Abort:
+        raise KeyboardInterrupt from None
+    return code if isinstance(code, int) else 0
 
 
 def _report_usage(error: Exception, debug: bool) -> int:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pgdm.cli.errors import EXPECTED, one_line, report
+from pgdm.cli.errors import EXPECTED, guarded, report
 from pgdm.cli.flags import Flags, read_flags
 from pgdm.errors import ConfigError
 
@@ -35,11 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``pgdm-run`` and return its exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
-    with one_line(debug):
-        try:
-            return _main(read_flags(arguments), debug)
-        except EXPECTED as error:
-            return report(error, debug)
+    return guarded(lambda: _main(read_flags(arguments), debug), debug)
 
 
 def _main(flags: Flags, debug: bool) -> int:
