@@ -1,17 +1,9 @@
-"""Reading ``.npz``, ``.npy`` and pickle files without running code from them.
-
-TCDM keeps its start states in a pickled object array; ``numpy.load(allow_pickle=True)`` would run
-whatever such a file asks for. Here a pickle is first read as a list of opcodes, of which only the
-ones that build plain values are admitted, and then loaded with stand-ins for NumPy's few helpers,
-so that not even NumPy's own ``__setstate__`` sees the file's bytes.
-"""
+"""Reading ``.npz`` and ``.npy`` files without running code from them."""
 
 from __future__ import annotations
 
 import io
 import math
-import pickle
-import pickletools
 import zipfile
 import zlib
 from pathlib import Path
@@ -19,212 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from pgdm.errors import CorruptAssetError, UnsafePickleError
+from pgdm.errors import CorruptAssetError
+from pgdm.library.safe_pickle import PLAIN_KINDS, READ_ERRORS, loads, read_bytes, reason
 
 MAX_MEMBER_BYTES = 256 * 2**20
 """Largest array file that is read, bytes; the real ones have a few thousand."""
-
-_MAX_DEPTH = 16
-_PLAIN_KINDS = "biufSU"
-_OPCODE_NAMES = (
-    "PROTO FRAME STOP MARK NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 INT LONG LONG1 LONG4 "
-    "FLOAT BINFLOAT UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 STRING BINSTRING "
-    "SHORT_BINSTRING BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 EMPTY_DICT EMPTY_LIST "
-    "EMPTY_TUPLE DICT LIST TUPLE TUPLE1 TUPLE2 TUPLE3 APPEND APPENDS SETITEM SETITEMS GET BINGET "
-    "LONG_BINGET PUT BINPUT LONG_BINPUT MEMOIZE GLOBAL STACK_GLOBAL REDUCE BUILD"
-)
-_OPCODES = frozenset(_OPCODE_NAMES.split())
-_PUTS = frozenset({"PUT", "BINPUT", "LONG_BINPUT"})
-_READ_ERRORS = (
-    pickle.UnpicklingError,
-    ValueError,  # covers UnicodeDecodeError
-    TypeError,
-    LookupError,
-    AttributeError,
-    EOFError,
-    OverflowError,
-    MemoryError,
-    RecursionError,
-    ImportError,
-)
-
-
-class _DType:
-    """Stands in for a pickled ``numpy.dtype``."""
-
-    __slots__ = ("big", "code")
-
-    def __init__(self, code: str) -> None:
-        self.code, self.big = code, False
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        # (version, byte order, subarray, names, fields, size, alignment, flags[, metadata])
-        if any(part is not None for part in state[2:5]):
-            raise ValueError("a structured dtype")
-        if state[1] not in ("<", ">", "|", "="):
-            raise ValueError(f"byte order {state[1]!r}")
-        self.big = state[1] == ">"
-
-    def real(self) -> np.dtype[Any]:
-        """Return the dtype that is meant; only numbers, strings and objects are."""
-        if self.code in ("O", "O8"):
-            return np.dtype(object)
-        dtype = np.dtype(self.code)
-        if dtype.kind not in _PLAIN_KINDS:
-            raise ValueError(f"dtype {self.code!r}")
-        return dtype.newbyteorder(">") if self.big else dtype
-
-
-class _Array:
-    """Stands in for a pickled ``numpy.ndarray``."""
-
-    __slots__ = ("value",)
-
-    def __init__(self, value: np.ndarray | None = None) -> None:
-        self.value = value
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        _, shape, dtype, fortran, data = state
-        self.value = _array(data, dtype, shape, "F" if fortran else "C")
-
-
-def _array(data: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
-    if not isinstance(dtype, _DType):
-        raise ValueError("an array without dtype")
-    real = dtype.real()
-    shape = tuple(int(n) for n in shape)
-    count = math.prod(shape)
-    if real.kind == "O":
-        if not isinstance(data, list) or len(data) != count:
-            raise ValueError("an object array whose items do not match its shape")
-        value = np.empty(count, dtype=object)
-        for i, item in enumerate(data):
-            value[i] = item
-    else:
-        if isinstance(data, str):
-            data = data.encode("latin1")
-        if not isinstance(data, bytes | bytearray) or len(data) != count * real.itemsize:
-            raise ValueError("an array whose bytes do not match its shape")
-        value = np.frombuffer(bytes(data), dtype=real).copy()
-    return value.reshape(shape, order="F" if order == "F" else "C")
-
-
-class _Helper:
-    """A callable the pickle may use; without ``__dict__``, so that it cannot be changed."""
-
-    __slots__ = ("_name",)
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __call__(self, *args: Any) -> Any:
-        if self._name == "reconstruct":
-            return _Array()
-        if self._name == "dtype":
-            return _DType(str(args[0]))
-        if self._name == "scalar":
-            dtype, data = args
-            return _array(data, dtype, (), "C")[()]
-        if self._name == "frombuffer":
-            data, dtype, shape, order = args
-            return _Array(_array(data, dtype, shape, order))
-        if self._name == "encode":
-            text, codec = args
-            if codec not in ("latin1", "latin-1"):
-                raise ValueError(f"encoding {codec!r}")
-            return text.encode("latin1")
-        raise ValueError(f"calling numpy.{self._name}")
-
-
-_GLOBALS: dict[tuple[str, str], _Helper] = {
-    ("numpy", "dtype"): _Helper("dtype"),
-    ("numpy", "ndarray"): _Helper("ndarray"),
-    ("_codecs", "encode"): _Helper("encode"),
-}
-for _core in ("numpy.core", "numpy._core"):
-    _GLOBALS[f"{_core}.multiarray", "_reconstruct"] = _Helper("reconstruct")
-    _GLOBALS[f"{_core}.multiarray", "scalar"] = _Helper("scalar")
-    _GLOBALS[f"{_core}.numeric", "_frombuffer"] = _Helper("frombuffer")
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, data: bytes, label: str) -> None:
-        super().__init__(io.BytesIO(data), encoding="latin1")
-        self._label = label
-
-    def find_class(self, module: str, name: str) -> Any:
-        try:
-            return _GLOBALS[module, name]
-        except KeyError:
-            raise _refused(self._label, f"{module}.{name}") from None
-
-
-def _refused(label: str, what: str) -> UnsafePickleError:
-    return UnsafePickleError(
-        f"{label}: the pickle asks for {what}, which plain arrays do not need; the file is not "
-        "what it seems, get it again from its source"
-    )
-
-
-def _scan(data: bytes, label: str) -> None:
-    """Refuse opcodes and names that plain values do not need, before anything is loaded."""
-    for opcode, arg, _ in pickletools.genops(data):
-        if opcode.name not in _OPCODES:
-            raise _refused(label, f"the opcode {opcode.name}")
-        if opcode.name == "GLOBAL":
-            module, _, name = str(arg).partition(" ")
-            if (module, name) not in _GLOBALS:
-                raise _refused(label, f"{module}.{name}")
-        # A huge index would make the unpickler allocate as many entries.
-        if opcode.name in _PUTS and int(arg or 0) > len(data):
-            raise ValueError("a memo index beyond the file's size")
-
-
-def _plain(value: Any, seen: dict[int, Any], depth: int = 0) -> Any:
-    """Replace the stand-ins in ``value`` by what they stand for."""
-    if depth > _MAX_DEPTH:
-        raise ValueError(f"values nested deeper than {_MAX_DEPTH}")
-    if isinstance(value, _Helper | _DType):
-        raise ValueError("a NumPy helper in place of a value")
-    if id(value) in seen:
-        return seen[id(value)]
-    result = value
-    if isinstance(value, _Array):
-        if value.value is None:
-            raise ValueError("an array without content")
-        result = value.value
-        if result.dtype.kind == "O":
-            flat = [_plain(v, seen, depth + 1) for v in result.ravel()]
-            result = _array(flat, _DType("O"), result.shape, "C")
-    elif isinstance(value, dict):
-        result = {_plain(k, seen, depth + 1): _plain(v, seen, depth + 1) for k, v in value.items()}
-    elif isinstance(value, list | tuple):
-        result = type(value)(_plain(v, seen, depth + 1) for v in value)
-    seen[id(value)] = result
-    return result
-
-
-def loads(data: bytes, label: str) -> Any:
-    """Load a pickle that holds only arrays, dicts, lists, tuples, strings and numbers.
-
-    Args:
-        data: the pickle.
-        label: the file's name, for messages.
-
-    Raises:
-        UnsafePickleError: it asks for anything else.
-        CorruptAssetError: it cannot be read.
-    """
-    try:
-        _scan(data, label)
-        return _plain(_Unpickler(data, label).load(), {})
-    except _READ_ERRORS as error:
-        raise CorruptAssetError(f"{label}: unreadable pickle ({_reason(error)})") from error
-
-
-def read_pickle(path: Path) -> Any:
-    """Load a pickle file like :func:`loads`."""
-    return loads(_read_bytes(path), str(path))
 
 
 def read_npz(path: Path) -> dict[str, Any]:
@@ -239,7 +30,7 @@ def read_npz(path: Path) -> dict[str, Any]:
     """
     result: dict[str, Any] = {}
     try:
-        with zipfile.ZipFile(io.BytesIO(_read_bytes(path))) as archive:
+        with zipfile.ZipFile(io.BytesIO(read_bytes(path))) as archive:
             for info in archive.infolist():
                 name = info.filename.removesuffix(".npy")
                 if info.file_size > MAX_MEMBER_BYTES:
@@ -248,9 +39,9 @@ def read_npz(path: Path) -> dict[str, Any]:
                         f"{MAX_MEMBER_BYTES} allowed"
                     )
                 result[name] = parse_npy(archive.read(info), f"{path}: {name}")
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, *_READ_ERRORS) as e:
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, *READ_ERRORS) as e:
         raise CorruptAssetError(
-            f"{path}: not a readable .npz ({_reason(e)}); get it again from its source"
+            f"{path}: not a readable .npz ({reason(e)}); get it again from its source"
         ) from e
     return result
 
@@ -279,22 +70,11 @@ def parse_npy(data: bytes, label: str) -> Any:
         if dtype.hasobject:
             value = loads(body, label)
             return value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
-        if dtype.kind not in _PLAIN_KINDS:
+        if dtype.kind not in PLAIN_KINDS:
             raise ValueError(f"dtype {dtype}")
         if any(n < 0 for n in shape) or math.prod(shape) * dtype.itemsize != len(body):
             raise ValueError(f"{len(body)} bytes do not make an array of shape {shape}")
         value = np.frombuffer(body, dtype=dtype).copy()
         return value.reshape(shape, order="F" if fortran else "C")
-    except _READ_ERRORS as error:
-        raise CorruptAssetError(f"{label}: unreadable array ({_reason(error)})") from error
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise CorruptAssetError(f"{path}: cannot be read ({error.strerror})") from error
-
-
-def _reason(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    except READ_ERRORS as error:
+        raise CorruptAssetError(f"{label}: unreadable array ({reason(error)})") from error
