@@ -63,7 +63,9 @@ class ProgressView(callback.Callback):
         for kind in ("sampled", "deterministic"):
             success = metrics.get(f"eval_{kind}/success", math.nan)
             lifted = metrics.get(f"eval_{kind}/lifted", math.nan)
-            parts.append(f"{kind} success {success:.1%}, lifted {lifted:.0%}")
+            # Where the motion never rises there is nothing to lift.
+            held = f", lifted {lifted:.0%}" if math.isfinite(lifted) else ""
+            parts.append(f"{kind} success {success:.1%}{held}")
         self._print(f"evaluation at {progress.frames:,} frames: {'; '.join(parts)}")
 
     def on_end(self, progress: callback.Progress, status: str) -> None:

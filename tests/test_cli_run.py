@@ -1,0 +1,324 @@
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from command_line import TINY, command, process
+from pgdm.cli.errors import message
+from pgdm.cli.flags import read_flags
+from pgdm.cli.progress import ProgressView, duration
+from pgdm.cli.stop import StopRequest
+from pgdm.cli.summary import summary_table
+from pgdm.config.groups import available, groups
+from pgdm.config.store import compose
+from pgdm.errors import ConfigError
+from pgdm.experiment import RunResult
+from pgdm.rl.callback import Progress
+
+# The command line itself.
+
+
+def test_help_names_every_group_and_option() -> None:
+    outcome = command("pgdm-run", "--help")
+    assert (outcome.code, outcome.err) == (0, "")
+    for group in groups():
+        assert f"  {group} " in outcome.out.replace("+", "")
+        assert all(option in outcome.out for option in available(group))
+    for key in ("seed", "total_frames", "num_envs", "num_threads", "run_dir", "resume", "budget"):
+        assert f"  {key}=" in outcome.out
+
+
+def test_help_lists_your_own_settings_too(tmp_path: Path) -> None:
+    (tmp_path / "mine" / "task").mkdir(parents=True)
+    (tmp_path / "mine" / "task" / "juggle.yaml").touch()
+    assert "juggle" in command("pgdm-run", "--config-dir", "mine", "--help").out
+
+
+@pytest.mark.parametrize("name", ["pgdm-run", "pgdm"])
+def test_version(name: str) -> None:
+    outcome = command(name, "--version")
+    assert outcome.code == 0
+    assert outcome.out.startswith("pgdm 0.")
+
+
+@pytest.mark.parametrize("module", ["run", "main"])
+def test_help_and_completion_load_nothing_heavy(module: str) -> None:
+    code = (
+        f"import sys, pgdm.cli.{module}, pgdm.cli.help;"
+        "print({'torch', 'mlflow', 'torchrl', 'hydra', 'matplotlib'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_cfg_prints_and_does_nothing(tmp_path: Path) -> None:
+    outcome = process("pgdm-run", "+experiment=quickstart", "seed=5", "--cfg", "job")
+    assert outcome.code == 0
+    assert "seed: 5\n" in outcome.out
+    assert "kind: residual" in outcome.out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_debug_shows_the_traceback() -> None:
+    outcome = command("pgdm-run", "--debug", "task=hammer-use9")
+    assert "Traceback" in outcome.err
+    assert len(outcome.errors) == 1
+
+
+def test_an_error_that_nobody_expected_is_one_line_too() -> None:
+    spoil = "import pgdm.cli.help as h; h.help_text = lambda d: 1 / 0"
+    outcome = process("pgdm-run", "--help", before=spoil)
+    assert outcome.code == 1
+    assert outcome.errors == [
+        "error: ZeroDivisionError: division by zero (a defect of pgdm: please report it with what "
+        "--debug shows)"
+    ]
+    assert "Traceback" not in outcome.err
+    assert "Traceback" in process("pgdm-run", "--help", "--debug", before=spoil).err
+
+
+def test_output_that_nobody_reads_is_no_error() -> None:
+    code = "from pgdm.cli.run import main; import sys; sys.exit(main(['--help']))"
+    shell = f'"{sys.executable}" -c "{code}" | true'
+    done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, check=True)
+    assert "rror" not in done.stderr
+
+
+def test_flags_may_stand_anywhere_and_in_short() -> None:
+    line = ["seed=1,2", "-m", "-cd", "mine", "--debug", "task=a", "--offline", "-c=all", "-i"]
+    flags = read_flags(line)
+    assert flags.ours == {"--debug", "--offline"}
+    assert flags.hydras == [
+        "--multirun", "--config-dir", "mine", "--cfg", "all", "--info", "all",
+    ]  # fmt: skip
+    assert flags.overrides == ["seed=1,2", "task=a", "offline=true"]
+    assert flags.config_dir == "mine"
+    assert flags.multirun
+
+
+words = st.sampled_from(["-m", "--cfg", "job", "--info", "--config-dir", "-h", "--debug", "a=1"])
+
+
+@given(st.lists(words | st.text(max_size=6), max_size=6))
+def test_any_command_line_is_sorted_or_refused(line: list[str]) -> None:
+    try:
+        flags = read_flags(line)
+    except ConfigError as error:
+        assert str(error)
+    else:
+        kept = {*flags.ours, *flags.hydras, *flags.overrides}
+        assert {word for word in line if not word.startswith("-")} <= kept
+
+
+@pytest.mark.parametrize("error", [MemoryError(), KeyboardInterrupt(), OSError(28, "x", "f")])
+def test_errors_of_the_machine_name_a_cure(error: BaseException) -> None:
+    assert any(word in message(error) for word in ("num_envs", "same command"))
+
+
+# What is shown.
+
+
+class FakeTrainer:
+    """As much of a trainer as a display looks at."""
+
+    def __init__(self, frames: int, total: int) -> None:
+        self.progress = Progress(frames, total, 0, 0.0)
+
+
+def show(console: Console) -> None:
+    view = ProgressView("hammer-use1", console)
+    view.on_start(FakeTrainer(0, 3000))  # type: ignore[arg-type]
+    metrics = {"train/steps_per_s": 2034.5, "train/success": 0.125, "train/return": 17.25}
+    time.sleep(0.01)
+    view.on_iteration(Progress(1000, 3000, 1, 0.5), metrics)
+    view.on_iteration(Progress(2000, 3000, 2, 1.0), {"train/success": float("nan")})
+    evaluated = {"eval_sampled/success": 0.5, "eval_deterministic/success": 0.75}
+    evaluated |= {"eval_deterministic/lifted": 0.25, "eval_sampled/lifted": float("nan")}
+    view.on_evaluation(Progress(3000, 3000, 3, 1.5), evaluated)
+    view.on_end(Progress(3000, 3000, 3, 75.0), "finished")
+
+
+def test_plain_lines_without_a_terminal() -> None:
+    console = Console(file=io.StringIO(), width=60)
+    show(console)
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert lines == [
+        "1,000/3,000 frames | 2,034 steps/s | success 12.5% | return 17.2 | 0:00 left",
+        "evaluation at 3,000 frames: sampled success 50.0%; "
+        "deterministic success 75.0%, lifted 25%",
+        "finished at 3,000 frames, 1:15",
+    ]
+
+
+def test_one_live_line_on_a_terminal() -> None:
+    console = Console(file=io.StringIO(), width=120, force_terminal=True)
+    show(console)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "hammer-use1" in text
+    assert "evaluation at 3,000 frames" in text
+    assert "\x1b[?25h" in text  # the cursor is back
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0, "0:00"), (59.6, "1:00"), (3723, "1:02:03")])
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def table_of(overrides: list[str], frames: int) -> str:
+    before = {"eval_sampled/success": 0.01}
+    after = {"eval_sampled/success": 0.5, "eval_deterministic/com_error_released": 2e-3}
+    result = RunResult("finished", Path(), frames, before, after, None, "checkout")
+    console = Console(file=io.StringIO(), width=120)
+    console.print(summary_table(compose(overrides), result))
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_reduced_run_is_never_set_against_the_paper_without_saying_so() -> None:
+    text = " ".join(table_of(["+experiment=quickstart"], 450_560).split())
+    assert "99.3%" in text  # the paper's
+    assert "2.00e-03" in text
+    assert "COM error, released [m]" in text
+    assert "not comparable with the paper's figures: 450,560 of 50,000,000 frames" in text
+    assert "action=residual, algo=ppo_fast" in text
+
+
+def test_the_papers_settings_are_comparable() -> None:
+    text = table_of([], 50_000_000)
+    assert "not comparable" not in text
+    assert "means of 3 seeds" in text
+
+
+def test_a_task_that_the_paper_does_not_rate() -> None:
+    assert "the paper reports no figure" in table_of(["task=dmanus-sim2real"], 100)
+
+
+# Stopping.
+
+
+def test_the_first_signal_asks_the_second_ends() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with StopRequest() as stop:
+        assert not stop()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop()
+        assert stop.exit_code == 143
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+# Whole runs.
+
+
+def test_a_run_from_start_to_table_and_on(library_home: Path, tmp_path: Path) -> None:
+    first = command("pgdm-run", "--offline", *TINY, "run_dir=run", "seed=3")
+    assert (first.code, first.errors) == (0, [])
+    assert "hammer-use1 (pgdm, absolute action, ppo, seed 3)" in first.out
+    assert "budget 'smoke', not comparable" in " ".join(first.out.split())
+    assert "run:    run" in first.out
+    assert "32/32 frames" in first.err or "finished at 32 frames" in first.err
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert (result["status"], result["frames"]) == ("finished", 32)
+
+    again = command("pgdm-run", "--offline", *TINY, "run_dir=run", "seed=3")
+    assert again.code == 0
+    assert "finished already" in again.err
+    assert again.out == first.out
+
+    longer = [*TINY, "run_dir=run", "seed=3", "total_frames=64"]
+    grown = command("pgdm-run", "--offline", *longer)
+    assert grown.code == 0
+    assert "at 32 frames" in grown.err
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["frames"] == 64
+
+
+def test_eval_measures_what_the_run_measured(library_home: Path, tmp_path: Path) -> None:
+    run = command(
+        "pgdm-run", "--offline", *TINY, "task=duck-lift", "eval.episodes=3", "run_dir=run"
+    )
+    assert run.code == 0, run.err
+    row = next(line for line in run.out.splitlines() if "return" in line).split("│")
+    for target in ("run", "run/checkpoints/frames_000000000032.ckpt"):
+        outcome = command("pgdm", "eval", target)
+        assert outcome.code == 0, outcome.err
+        again = next(line for line in outcome.out.splitlines() if "return" in line).split("│")
+        assert [cell.strip() for cell in again[2:4]] == [cell.strip() for cell in row[3:5]]
+        assert "(32 frames)" in outcome.out
+
+
+def test_view_films_a_task(library_home: Path, tmp_path: Path) -> None:
+    outcome = command("pgdm", "view", "duck-lift", "--video", "out/a.mp4", "--offline")
+    if "no OpenGL" in outcome.err:
+        pytest.skip(outcome.err)
+    assert outcome.code == 0, outcome.err
+    assert (tmp_path / "out" / "a.mp4").read_bytes()[4:8] == b"ftyp"
+    assert "video:  out/a.mp4" in outcome.out
+
+
+def test_tasks_lists_all(library_home: Path) -> None:
+    outcome = command("pgdm", "tasks")
+    assert outcome.code == 0
+    assert [line.split()[0] for line in outcome.out.splitlines()[1:]] == available("task")
+    assert all("checkout" in line for line in outcome.out.splitlines()[1:])
+    assert len(command("pgdm", "tasks", "--tcdm30").out.splitlines()) == 31
+
+
+def test_tasks_says_what_is_missing() -> None:
+    assert "51 of 51 tasks are not in the asset library" in command("pgdm", "tasks").out
+
+
+def test_multirun_goes_on_after_a_failure_and_tells(library_home: Path, tmp_path: Path) -> None:
+    (tmp_path / "b").write_text("in the way")
+    outcome = command("pgdm-run", "--offline", "-m", *TINY, "run_dir=a,b,c")
+    assert outcome.code == 1
+    assert len(outcome.errors) == 1
+    assert "'b' is a file" in outcome.errors[0]
+    assert "1 of 3 runs failed" in outcome.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
+    for name in ("a", "c"):
+        assert json.loads((tmp_path / name / "result.json").read_text())["status"] == "finished"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_saves_and_the_same_command_goes_on(
+    library_home: Path, tmp_path: Path, number: signal.Signals, code: int
+) -> None:
+    line = ["--offline", *TINY, "run_dir=run", "eval.interval_frames=0"]
+    start = "import sys; from pgdm.cli.run import main; sys.exit(main())"
+    long = [sys.executable, "-c", start, *line, "total_frames=10_000_000"]
+    with subprocess.Popen(long, stderr=subprocess.PIPE, text=True) as training:
+        deadline = time.monotonic() + 120
+        metrics = tmp_path / "run" / "metrics.jsonl"
+        while not metrics.exists() or metrics.read_text().count("train") < 2:
+            assert training.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+        training.send_signal(number)
+        _, err = training.communicate(timeout=60)
+    assert training.returncode == code
+    assert "the same command goes on" in err
+    assert "Traceback" not in err
+    done = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert done["status"] == "interrupted"
+    assert list((tmp_path / "run" / "checkpoints").glob("frames_*.ckpt"))
+
+    config = tmp_path / "run" / "config.yaml"
+    config.write_text(config.read_text().replace("10000000", "32"))  # so that it may end soon
+    on = command("pgdm-run", *line, f"total_frames={done['frames'] + 16}")
+    assert on.code == 0, on.err
+    assert f"at {done['frames']:,} frames" in on.err
+
+
+def test_settings_are_plain_data() -> None:
+    assert json.loads(json.dumps(dataclasses.asdict(compose())))["task"]["id"] == "hammer-use1"
