@@ -53,6 +53,7 @@ print(time.perf_counter() - start)
 
 
 def actions_of(builder: EnvBuilder, num_envs: int) -> list[torch.Tensor]:
+    """Return the same random actions around the warm start for every measurement."""
     generator = torch.Generator().manual_seed(0)
     warm = builder.mdp.actions.warm_start.float()
     shape = (num_envs, len(warm))
@@ -106,6 +107,7 @@ class Clock(Callback):
         self.ends: list[float] = []
 
     def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
+        """Note the time."""
         self.ends.append(time.perf_counter())
 
 
@@ -136,6 +138,7 @@ def peak_memory_mib(task: str) -> float:
 
 
 def measure(task: str, rounds: int, console: Console) -> dict[str, list[float]]:
+    """Return each figure's value in every round."""
     builder = env_builder(compose([f"task={task}"]), open_library())
     actions = actions_of(builder, 64)
     figures: dict[str, list[float]] = {}
@@ -160,6 +163,7 @@ def measure(task: str, rounds: int, console: Console) -> dict[str, list[float]]:
 
 
 def main() -> None:
+    """Measure, print, store."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="hammer-use1")
     parser.add_argument("--rounds", type=int, default=5)
