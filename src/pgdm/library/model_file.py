@@ -50,7 +50,8 @@ def _parse(path: Path, defects: list[str], root: Path, parents: tuple[Path, ...]
     except ET.ParseError as error:
         raise CorruptAssetError(f"{label}: not well-formed XML ({error})") from error
     except OSError as error:
-        raise CorruptAssetError(f"{label}: cannot be read ({error.strerror})") from error
+        by = f", included by {_label(parents[-1], root)}" if parents else ""
+        raise CorruptAssetError(f"{label}{by}: cannot be read ({error.strerror})") from error
     for item in element.iter():
         _repair(item, label, defects)
         reference = item.get("file")

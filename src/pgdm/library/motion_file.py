@@ -114,7 +114,7 @@ def numbers(
         want is None or want == have for want, have in zip(shape, value.shape, strict=True)
     )
     if not fits:
-        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        wanted = str(tuple("any" if n is None else n for n in shape)).replace("'", "")
         raise CorruptAssetError(f"{label}: '{key}' has shape {value.shape}, expected {wanted}")
     value = value.astype(np.float64)
     if not np.isfinite(value).all():

@@ -27,6 +27,7 @@ from pgdm.library.report import Progress
 _BLOCK = 1 << 18
 _ATTEMPTS = 6
 _TIMEOUT_S = 60.0
+_PAUSE_S = 0.5
 _REFUSALS = (401, 403, 407)
 
 
@@ -79,8 +80,7 @@ def fetch(package: Package, folder: Path, offline: bool, progress: Progress) -> 
         folder.mkdir(parents=True, exist_ok=True)
         _room(package, folder)
         part = target.with_name(f"{target.name}.part")
-        address = _locate(package)
-        _receive(package, address, part, progress)
+        receive(package, locate(package), part, progress)
         part.replace(target)
     except OSError as error:
         raise LibraryError(f"{folder}: cannot be written ({error.strerror or error})") from error
@@ -101,8 +101,15 @@ def _pip(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def _locate(package: Package) -> str:
-    """Ask pip where the file lies."""
+def locate(package: Package) -> str:
+    """Ask pip where the file lies.
+
+    Returns:
+        Its address, ``http``, ``https`` or ``file``.
+
+    Raises:
+        LibraryError: pip is missing, or no index that it is set up for has the file.
+    """
     answer = _pip(
         "install", "--dry-run", "--no-deps", "--ignore-installed", "--ignore-requires-python",
         "--only-binary=:all:", "--disable-pip-version-check", "--quiet", "--report", "-",
@@ -128,8 +135,33 @@ def _locate(package: Package) -> str:
         raise LibraryError("pip's answer cannot be read; update pip to 22.2 or later") from error
 
 
-def _receive(package: Package, address: str, part: Path, progress: Progress) -> None:
-    """Bring the whole file to ``part`` and verify it."""
+def receive(package: Package, address: str, part: Path, progress: Progress) -> None:
+    """Bring the whole file to ``part`` and verify it.
+
+    Args:
+        package: what is expected.
+        address: from :func:`locate`.
+        part: file to write, or to continue if an earlier call left it.
+        progress: told about bytes.
+
+    Raises:
+        LibraryError: the download broke off for good, or brought something else.
+    """
+    continued = part.exists()
+    _stream_all(package, address, part, progress)
+    if part.stat().st_size == package.bytes and sha256_of(part) == package.sha256:
+        return
+    part.unlink()
+    if continued:  # what was left by the earlier call may have been at fault
+        receive(package, address, part, progress)
+        return
+    raise LibraryError(
+        f"{package.file}: what the index sent is not the file expected (SHA-256 "
+        f"{package.sha256[:12]}...); nothing was kept, run the command again"
+    )
+
+
+def _stream_all(package: Package, address: str, part: Path, progress: Progress) -> None:
     for attempt in range(_ATTEMPTS):
         have = part.stat().st_size if part.exists() else 0
         if have >= package.bytes:
@@ -145,13 +177,7 @@ def _receive(package: Package, address: str, part: Path, progress: Progress) -> 
                     f"the download of {package.file} broke off at {done >> 20} of "
                     f"{package.bytes >> 20} MiB ({error}); run the command again to go on"
                 ) from error
-            time.sleep(min(2.0**attempt, 15.0) * 0.5)
-    if part.stat().st_size != package.bytes or sha256_of(part) != package.sha256:
-        part.unlink()
-        raise LibraryError(
-            f"{package.file}: what the index sent is not the file expected (SHA-256 "
-            f"{package.sha256[:12]}...); nothing was kept, run the command again"
-        )
+            time.sleep(_PAUSE_S * 2.0**attempt)
 
 
 def _stream(package: Package, address: str, part: Path, progress: Progress) -> None:
