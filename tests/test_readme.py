@@ -26,7 +26,12 @@ MAKE_RUN = f"make run VENV={sys.prefix} --assume-old={sys.prefix}/.run"
 BY_CI = ("make test", "make check", "make docs", "make slow")
 
 # Run here as they stand; each needs seconds.
-QUICK = ("pgdm-run --help", "pgdm runs", "pgdm assets list", "pgdm assets show cup-pour1")
+QUICK = (
+    "pgdm-run --help",
+    "pgdm tasks",
+    "pgdm assets list",
+    "pgdm assets show cup-pour1",
+)
 
 # Run here, in this order and in one folder, with a smaller budget: command -> what is run.
 CUP = "pgdm-run task=cup-pour1 action=residual algo=ppo_fast"
