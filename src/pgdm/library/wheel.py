@@ -35,7 +35,8 @@ def unpack(
     """
     try:
         with zipfile.ZipFile(archive) as source:
-            members = [m for m in source.infolist() if not m.is_dir() and wanted(m.filename)]
+            every = source.infolist()
+            members = [m for m in every if m.filename[-1:] != "/" and wanted(m.filename)]
             for member in members:
                 _refuse(archive, member)
             for i, member in enumerate(members):
@@ -55,7 +56,7 @@ def _refuse(archive: Path, member: zipfile.ZipInfo) -> None:
     name = member.orig_filename
     path = PurePosixPath(name)
     outside = path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name
-    if outside or "\0" in name:
+    if outside or not path.parts or "\0" in name:
         raise CorruptAssetError(f"{archive}: its member '{name}' would leave the library's folder")
     if stat.S_ISLNK(member.external_attr >> 16):
         raise CorruptAssetError(f"{archive}: its member '{name}' is a link")
