@@ -1,0 +1,77 @@
+"""A library that fills itself when a task is missing."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from library_trees import make_checkout
+from pgdm.errors import LibraryError, UnknownNameError
+from pgdm.library import ensure, figures, import_tcdm, names, open_library, provide
+from pgdm.library.provide import Spoken
+
+
+def test_what_is_there_is_not_fetched(tmp_path: Path) -> None:
+    import_tcdm(make_checkout(tmp_path / "TCDM"), tmp_path / "library")
+    said: list[str] = []
+    library = ensure("hammer-use1", False, said.append, tmp_path / "library")
+    assert library.source_of("hammer-use1") == "checkout"
+    assert said == []
+
+
+def test_offline_refuses_with_the_cure(tmp_path: Path) -> None:
+    with pytest.raises(
+        LibraryError, match=r"--offline forbids fetching it; run 'pgdm assets"
+    ):
+        ensure("cup-pour1", True, root=tmp_path / "library")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_task_that_only_a_checkout_has_is_not_fetched(tmp_path: Path) -> None:
+    with pytest.raises(LibraryError, match=r"'door-open' comes only from a TCDM checkout.*import"):
+        ensure("door-open", False, root=tmp_path / "library")
+
+
+def test_a_task_that_does_not_exist_is_told_from_a_missing_one(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="unknown task 'hammer-use'; did you mean hammer-us"):
+        ensure("hammer-use", False, root=tmp_path / "library")
+
+
+def test_a_fetch_is_announced_with_size_and_licence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
+    said: list[str] = []
+    with pytest.raises(LibraryError, match=r"pip finds no robohive==0\.4\.0"):
+        ensure("cup-pour1", False, said.append, tmp_path / "library")
+    assert "fetching robohive 0.4.0 (101 MB, once)" in said[0]
+    assert "GRAB" in said[0]
+    assert "non-commercial" in said[0]
+    with caplog.at_level(logging.INFO), pytest.raises(LibraryError):
+        ensure("cup-pour1", False, None, tmp_path / "library")
+    assert "fetching robohive" in caplog.text
+    assert open_library(tmp_path / "library").tasks() == {}
+
+
+def test_the_two_sources_make_51_tasks() -> None:
+    every = [*figures.GRAB_TASKS, *provide.OTHER_TASKS]
+    assert len(figures.GRAB_TASKS) == 40
+    assert len(set(every)) == 51
+    assert all(names.hand_of(task) == "adroit" for task in figures.GRAB_TASKS)
+
+
+def test_progress_in_words_comes_now_and_then_with_an_estimate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(provide.time, "monotonic", lambda: now[0])
+    said: list[str] = []
+    spoken = Spoken(said.append, interval_s=5.0)
+    for second in range(11):
+        now[0] = 100.0 + second
+        spoken("download", 10 * second, 200)
+    # 10 a second: at 5 s 50 of 200 are done and 150 left, at 10 s 100.
+    assert said == ["download: 25%, 15 s left", "download: 50%, 10 s left"]
