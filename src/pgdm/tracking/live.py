@@ -128,6 +128,8 @@ class MlflowTracker(Tracker):
         mirror.link({**self._facts, "attempts": attempts})
         if run is None:
             mirror.log(points(self._folder, self._earlier))
+            if self._earlier:
+                mirror.posters()
         else:
             mirror.set_status("running")
         mirror.describe({"attempts": str(attempts)})

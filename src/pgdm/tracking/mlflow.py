@@ -230,6 +230,12 @@ class Mirror:
         with Image.open(path) as picture:
             self._client.log_image(self.run_id, picture, key="evaluation", step=frames)
 
+    def posters(self) -> None:
+        """Show the posters of all films in the folder."""
+        for path in sorted((self._folder.path / "videos").glob("*.png")):
+            digits = "".join(filter(str.isdigit, path.stem))
+            self.poster(path, int(digits or 0))
+
     def set_status(self, status: str, end_s: float | None = None) -> None:
         """Set the run's status, and when it ended unless it is running."""
         if status == "running":

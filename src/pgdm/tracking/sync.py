@@ -83,6 +83,8 @@ def _sync_run(store: Store, folder: RunFolder) -> Synced:
             wanted = [(step, at, _missing(there, step, m)) for step, at, m in wanted]
     mirror = Mirror(store, folder, run)
     mirror.log(wanted)
+    if run is None:
+        mirror.posters()
     if action != "unchanged":
         mirror.link({})
         mirror.describe({_FINGERPRINT: fingerprint})

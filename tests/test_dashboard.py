@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fake_runs import empty_database, end, make, train
+from pgdm.cli.dashboard import HOST, dashboard, free_port
+from pgdm.errors import RunError
+from pgdm.tracking.run_folder import LINK, RunFolder, read_json
+
+__all__ = ["empty_database"]  # a fixture
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+PROGRAM = "import typer; from pgdm.cli.dashboard import dashboard; typer.run(dashboard)"
+PATIENCE_S = 240.0
+
+
+def test_port_that_is_taken_is_not_used() -> None:
+    with socket.socket() as listener:
+        listener.bind((HOST, 0))
+        listener.listen()
+        taken = listener.getsockname()[1]
+        other = free_port(taken)
+        assert other != taken
+    assert free_port(other) == other
+    assert 0 < free_port(99999) < 65536
+
+
+def test_folder_without_runs_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"no runs in .*runs'; `pgdm-run` starts one"):
+        dashboard()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_server_has_pages_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    dashboard(uri="http://mlflow.example:5000")
+    assert "http://mlflow.example:5000" in capsys.readouterr().out
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> RunFolder:
+    folder = make(tmp_path / "runs" / "hammer-use1" / "pgdm" / "s0")
+    train(folder)
+    end(folder)
+    return RunFolder(folder.path)
+
+
+@pytest.fixture
+def served(folder: RunFolder, tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start the command as from a terminal, in an environment that is not activated."""
+    env = {**os.environ, "PATH": "/usr/bin:/bin", "PYTHONUNBUFFERED": "1"}
+    env.pop("VIRTUAL_ENV", None)
+    command = [sys.executable, "-c", PROGRAM, "--port", str(free_port(0))]
+    process = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if "Ctrl-C" in line:
+            break
+    found = re.search(rf"http://{HOST}:\d+/\S+", "".join(lines))
+    assert found, lines
+    yield process, found.group()
+    process.kill()
+    process.stdout.close()
+    process.wait()
+
+
+def group_of(port: int) -> list[int]:
+    """Return the processes that mention a port on their command line."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                line = (entry / "cmdline").read_bytes().split(b"\0")
+            except OSError:
+                continue
+            if str(port).encode() in line and int(entry.name) != os.getpid():
+                found.append(int(entry.name))
+    return found
+
+
+def dom(url: str, profile: Path, wait_ms: int) -> str:
+    """Return a page as a browser has built it."""
+    assert CHROMIUM is not None
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
+    command += ["--disable-background-networking", "--disable-component-update", "--disable-sync"]
+    command += ["--no-first-run", "--disable-default-apps", f"--user-data-dir={profile}"]
+    command += [f"--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE {HOST}"]  # no other machine
+    command += [f"--virtual-time-budget={wait_ms}", "--window-size=1500,1100", "--dump-dom", url]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ends_cleanly(
+    number: signal.Signals, served: tuple[subprocess.Popen[str], str], tmp_path: Path
+) -> None:
+    process, url = served
+    port = int(url.split(":")[2].split("/")[0])
+    direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    with direct.open(f"http://{HOST}:{port}/health", timeout=30) as answer:
+        assert answer.status == 200
+    with socket.socket() as probe:  # only this machine: not on the addresses others reach
+        assert probe.connect_ex((HOST, port)) == 0
+    assert len(group_of(port)) >= 2
+    process.send_signal(number)
+    assert process.wait(60) == 0
+    assert process.stdout is not None and "dashboard ended" in process.stdout.read()
+    deadline = time.monotonic() + 10
+    while group_of(port):
+        assert time.monotonic() < deadline
+        time.sleep(0.2)
+    assert not (tmp_path / "mlruns").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_browser_shows_the_run(
+    served: tuple[subprocess.Popen[str], str], folder: RunFolder, tmp_path: Path
+) -> None:
+    _, url = served
+    runs = dom(url, tmp_path / "one", 60_000)
+    assert "hammer-use1 s0 pgdm" in runs
+    assert "Model training" in runs
+    run_id = read_json(folder.path / LINK)["run_id"]
+    page = url.split("/runs?")[0] + f"/runs/{run_id}"
+    overview = dom(page, tmp_path / "two", 60_000)
+    for text in ("Finished", "pregrasp_source", "asset_source", "eval_sampled/success"):
+        assert text in overview
+    charts = dom(f"{page}/model-metrics", tmp_path / "three", 90_000)
+    assert "eval_deterministic" in charts and "com_error_released" in charts
+    files = dom(f"{page}/artifacts", tmp_path / "four", 60_000)
+    assert "config.yaml" in files and "checkpoints" in files and "videos" in files
