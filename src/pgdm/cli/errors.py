@@ -43,7 +43,7 @@ def message(error: BaseException) -> str:
     if isinstance(error, PgdmError):
         text = str(error)
     elif isinstance(error, KeyboardInterrupt):
-        text = "interrupted; the same command goes on from the last checkpoint"
+        text = "interrupted; a run goes on from its last checkpoint by the same command"
     elif isinstance(error, MemoryError):
         text = "out of memory; use fewer simulations (num_envs=...) or a smaller algo.hidden"
     elif isinstance(error, OSError):

@@ -112,5 +112,5 @@ def find_checkpoint(path: Path, best: bool) -> tuple[Path, Path]:
     checkpoints = CheckpointFolder(path / "checkpoints", keep_last=1)
     found = [checkpoints.best] if best and checkpoints.best.is_file() else checkpoints.all()
     if not found:
-        raise CheckpointError(f"'{path}' has no checkpoint yet; run pgdm-run run_dir={path} again")
+        raise CheckpointError(f"'{path}' has no checkpoint yet; start its command again")
     return path, found[-1]

@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -123,6 +124,12 @@ def _checked(jobs: list[_Job]) -> list[ExperimentCfg]:
             if len(jobs) == 1:
                 raise
             raise ConfigError(f"{error} (in the run {job.name}; none was started)") from error
+    shared = [name for name, times in Counter(cfg.run_dir for cfg in configs).items() if times > 1]
+    if shared:
+        raise ConfigError(
+            f"several of the runs would share run_dir '{shared[0]}' (none was started); leave "
+            "run_dir out, or make it differ: run_dir=out/${seed}"
+        )
     return configs
 
 

@@ -85,7 +85,8 @@ class ExperimentCfg:
         self._check_batch()
         self._check_hand()
         self._check_placements()
-        _check_device(self.device)
+        if self.device.partition(":")[0] not in ("cpu", "cuda"):
+            raise UnknownNameError("device", self.device, ("cpu", "cuda"))
         if not self.run_dir.strip():
             raise ConfigError("run_dir is empty; name a folder, or null for the default")
         if not self.budget.strip():
@@ -200,11 +201,13 @@ def _check_ranges(flat: dict[str, object]) -> None:
         raise ConfigError(f"algo.hidden is {hidden}; every width must be at least 1")
 
 
-def _check_device(device: str) -> None:
-    kind = device.partition(":")[0]
-    if kind not in ("cpu", "cuda"):
-        raise UnknownNameError("device", device, ("cpu", "cuda"))
-    if kind == "cuda":
+def check_device(device: str) -> None:
+    """Check that this machine has the device; a run that is only looked at may need none.
+
+    Raises:
+        ConfigError: if it has not.
+    """
+    if device.startswith("cuda"):
         # Asked only here: looking for a GPU takes time, and most runs use none.
         import torch
 

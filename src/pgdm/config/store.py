@@ -52,7 +52,7 @@ def from_dict_config(composed: DictConfig) -> ExperimentCfg:
     """
     # The schema loads the simulator and torch: a wrong name should be answered before that.
     from pgdm.config.identity import default_run_dir
-    from pgdm.config.schema import ExperimentCfg
+    from pgdm.config.schema import ExperimentCfg, check_device
 
     try:
         plain = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
@@ -63,6 +63,7 @@ def from_dict_config(composed: DictConfig) -> ExperimentCfg:
     chosen = data.get("run_dir")
     cfg = build(ExperimentCfg, data | {"run_dir": "." if chosen is None else chosen})
     cfg.validate()
+    check_device(cfg.device)
     return cfg if chosen is not None else dataclasses.replace(cfg, run_dir=default_run_dir(cfg))
 
 
