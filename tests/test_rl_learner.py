@@ -11,33 +11,32 @@ from pgdm.errors import ConfigError, RunError
 from pgdm.rl import learner as learner_module
 from pgdm.rl.collector import Collector, Rollout
 from pgdm.rl.learner import Learner, PPOCfg, check_batch, explained_variance
-from pgdm.rl.loss import Minibatch
 from pgdm.rl.networks import ActorCritic, NetworkCfg
 from pgdm.rl.vec_env import VecEnv
 from pgdm.seeding import torch_stream
 from toy_envs import PAPER, TOY, PointEnv, ScriptedEnv
 
 
-def build(env: VecEnv, cfg: PPOCfg) -> tuple[Learner, Collector]:
+def build(env: VecEnv, cfg: PPOCfg, num_threads: int = 1) -> tuple[Learner, Collector]:
     network = NetworkCfg(
         env.obs_dim, env.action_dim, cfg.hidden, cfg.log_std_init, cfg.normalize_observations, 10.0
     )
     model = ActorCritic(network, torch_stream(0, "weights"))
     collector = Collector(env, model, cfg.steps_per_env, torch_stream(0, "actions"))
     collector.reset()
-    return Learner(model, cfg, torch_stream(0, "minibatches"), 1), collector
+    return Learner(model, cfg, torch_stream(0, "minibatches"), num_threads), collector
 
 
 def test_each_sample_is_visited_once_in_each_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
     learner, collector = build(PointEnv(8), TOY)
     visited: list[torch.Tensor] = []
-    real = learner_module.ppo_loss
+    real = learner_module.policy_loss
 
     def watch(*args: Any, **settings: Any) -> Any:
-        visited.append(args[3].obs)
+        visited.append(args[2].obs)
         return real(*args, **settings)
 
-    monkeypatch.setattr(learner_module, "ppo_loss", watch)
+    monkeypatch.setattr(learner_module, "policy_loss", watch)
     rollout = collector.collect()
     learner.learn(rollout)
     samples = rollout.obs[:-1].flatten(0, 1)
@@ -83,8 +82,8 @@ def test_all_of_an_iteration_sees_the_same_statistics() -> None:
     seen = second.obs[:-1].flatten(0, 1)
     torch.testing.assert_close(learner._prepare(second)[0].obs, normalizer(seen))
     # The policy that acted and the one that learns agree: the ratios of the first step are 1.
-    terms = learner._update(Minibatch(*(c[:64] for c in learner._prepare(second)[0])))
-    kl, clipped = float(terms[3]), float(terms[4])
+    logged = learner._update(learner._prepare(second)[0], torch.arange(64))
+    kl, clipped = float(logged[3]), float(logged[4])
     assert kl == pytest.approx(0, abs=1e-6)
     assert clipped == 0
     assert math.isfinite(metrics["loss_policy"])
@@ -106,10 +105,22 @@ def test_gradients_are_scaled_down_to_the_norm() -> None:
     cfg = replace(TOY, max_grad_norm=1e-3)
     learner, collector = build(PointEnv(8), cfg)
     batch, _ = learner._prepare(collector.collect())
-    stats = learner._update(batch)
-    assert float(stats[-1]) > 1e-3  # the norm before, as it is logged
+    logged = learner._update(batch, torch.arange(64))
+    assert float(logged[-1]) > 1e-3  # the norm before, as it is logged
     grads = torch.cat([p.grad.flatten() for p in learner.model.parameters() if p.grad is not None])
     assert float(grads.norm()) == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_the_number_of_threads_does_not_change_a_bit() -> None:
+    cfg = replace(TOY, hidden=[256, 128])  # wide enough that torch could split the products
+    results = []
+    for threads in (1, 2, 4):
+        learner, collector = build(PointEnv(8), cfg, threads)
+        metrics = learner.learn(collector.collect())
+        results.append((metrics, learner.model.state_dict()))
+    for metrics, state in results[1:]:
+        assert metrics == results[0][0]
+        assert all(torch.equal(state[name], results[0][1][name]) for name in state)
 
 
 def test_a_loss_that_is_not_finite_is_named_and_changes_nothing() -> None:

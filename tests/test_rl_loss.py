@@ -8,14 +8,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pgdm.rl.loss import LossTerms, Minibatch, advantages, ppo_loss
+from pgdm.rl.loss import PolicyLoss, Samples, advantages, policy_loss, value_loss
 from pgdm.rl.networks import ActorCritic, NetworkCfg, gaussian_entropy, gaussian_log_prob
 from pgdm.seeding import torch_stream
 from toy_envs import PAPER
 
 SETTINGS = {
     "clip": PAPER.clip,
-    "value_coef": PAPER.value_coef,
     "entropy_coef": PAPER.entropy_coef,
     "normalize_advantage": True,
 }
@@ -76,12 +75,12 @@ def test_the_value_after_a_termination_is_never_used() -> None:
     torch.testing.assert_close(got, torch.tensor([2.0]))
 
 
-def hand_batch(ratio: list[float], advantage: list[float]) -> tuple[Tensor, Tensor, Minibatch]:
+def hand_batch(ratio: list[float], advantage: list[float]) -> tuple[Tensor, Tensor, Samples]:
     """Return mean, log-std and samples whose probability ratios and advantages are given."""
     mean, log_std, action = torch.zeros(len(ratio), 1), torch.zeros(1), torch.zeros(len(ratio), 1)
     now = gaussian_log_prob(mean, log_std, action)
     old = now - torch.tensor(ratio).log()
-    samples = Minibatch(
+    samples = Samples(
         torch.zeros(len(ratio), 1), action, old, torch.tensor(advantage), torch.zeros(len(ratio))
     )
     return mean, log_std, samples
@@ -100,8 +99,8 @@ def hand_batch(ratio: list[float], advantage: list[float]) -> tuple[Tensor, Tens
 def test_clip_branches(ratio: float, advantage: float, expected: float) -> None:
     mean, log_std, samples = hand_batch([ratio], [advantage])
     settings = SETTINGS | {"normalize_advantage": False}
-    terms = ppo_loss(mean, log_std, torch.zeros(1), samples, **settings)
-    assert float(terms.policy) == pytest.approx(-expected)
+    terms = policy_loss(mean, log_std, samples, **settings)
+    assert float(terms.surrogate) == pytest.approx(-expected)
     assert float(terms.clip_fraction) == (0 if ratio == 1 else 1)
 
 
@@ -110,11 +109,11 @@ def test_hand_worked_loss() -> None:
     # Ratios 1.1 and 1.5: min terms 1.1 * -0.7071 and 1.2 * 0.7071; minus their mean -0.035355.
     # Value errors 1 and 2: mean square 2.5. Entropy of a unit Gaussian: 1.418939.
     mean, log_std, samples = hand_batch([1.1, 1.5], [1.0, 3.0])
-    terms = ppo_loss(mean, log_std, torch.tensor([1.0, -2.0]), samples, **SETTINGS)
-    assert float(terms.policy) == pytest.approx(-0.0353553, abs=1e-6)
-    assert float(terms.value) == pytest.approx(2.5)
+    terms = policy_loss(mean, log_std, samples, **SETTINGS)
+    assert float(terms.surrogate) == pytest.approx(-0.0353553, abs=1e-6)
+    assert float(value_loss(torch.tensor([1.0, -2.0]), samples.target)) == pytest.approx(2.5)
     assert float(terms.entropy) == pytest.approx(1.4189385)
-    assert float(terms.total) == pytest.approx(-0.0353553 + 0.5 * 2.5 - 0.001 * 1.4189385)
+    assert float(terms.total) == pytest.approx(-0.0353553 - 0.001 * 1.4189385, abs=1e-6)
     # (0.1 - ln 1.1 + 0.5 - ln 1.5) / 2
     assert float(terms.kl) == pytest.approx((0.6 - math.log(1.1) - math.log(1.5)) / 2, abs=1e-6)
     # 2.6^2 / (2 * (1.21 + 2.25))
@@ -124,8 +123,8 @@ def test_hand_worked_loss() -> None:
 
 def test_a_single_sample_is_not_standardised() -> None:
     mean, log_std, samples = hand_batch([1.0], [2.0])
-    terms = ppo_loss(mean, log_std, torch.zeros(1), samples, **SETTINGS)
-    assert float(terms.policy) == -2.0
+    terms = policy_loss(mean, log_std, samples, **SETTINGS)
+    assert float(terms.surrogate) == -2.0
 
 
 def test_log_prob_and_entropy_equal_torch() -> None:
@@ -142,7 +141,7 @@ def test_log_prob_and_entropy_equal_torch() -> None:
 D, A, M = 7, 3, 64
 
 
-def model_and_batch() -> tuple[ActorCritic, Minibatch]:
+def model_and_batch() -> tuple[ActorCritic, Samples]:
     """Return a model and a minibatch drawn from a somewhat different policy."""
     generator = torch_stream(1, "test")
     cfg = NetworkCfg(D, A, [16, 8], -0.5, normalize_observations=False, observation_clip=10.0)
@@ -151,11 +150,14 @@ def model_and_batch() -> tuple[ActorCritic, Minibatch]:
     action, log_prob = model.sample(obs, generator)
     log_prob = log_prob + 0.3 * torch.randn(M, generator=generator)
     advantage, target = torch.randn(M, generator=generator), torch.randn(M, generator=generator)
-    return model, Minibatch(obs, action, log_prob, advantage, target)
+    return model, Samples(obs, action, log_prob, advantage, target)
 
 
-def ours(model: ActorCritic, batch: Minibatch) -> LossTerms:
-    return ppo_loss(model.mean(batch.obs), model.log_std, model.value(batch.obs), batch, **SETTINGS)
+def ours(model: ActorCritic, batch: Samples) -> tuple[Tensor, PolicyLoss, Tensor]:
+    """Return the whole loss, the policy's part and the value function's, unweighted."""
+    policy = policy_loss(model.mean(batch.obs), model.log_std, batch, **SETTINGS)
+    error = value_loss(model.value(batch.obs), batch.target)
+    return policy.total + PAPER.value_coef * error, policy, error
 
 
 def gradients(model: nn.Module, loss: Tensor) -> list[Tensor]:
@@ -213,15 +215,15 @@ def test_equals_torchrl() -> None:
     )
     out = loss(data)
     total = out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]
-    terms = ours(model, batch)
+    whole, policy, error = ours(model, batch)
     close = {"rtol": 1e-4, "atol": 1e-6}
-    torch.testing.assert_close(terms.policy, out["loss_objective"], **close)
-    torch.testing.assert_close(PAPER.value_coef * terms.value, out["loss_critic"], **close)
-    torch.testing.assert_close(terms.entropy, out["entropy"], **close)
-    torch.testing.assert_close(terms.total, total, **close)
-    torch.testing.assert_close(terms.clip_fraction, out["clip_fraction"], **close)
-    torch.testing.assert_close(terms.ess, out["ESS"], **close)
-    for left, right in zip(gradients(model, terms.total), gradients(model, total), strict=True):
+    torch.testing.assert_close(policy.surrogate, out["loss_objective"], **close)
+    torch.testing.assert_close(PAPER.value_coef * error, out["loss_critic"], **close)
+    torch.testing.assert_close(policy.entropy, out["entropy"], **close)
+    torch.testing.assert_close(whole, total, **close)
+    torch.testing.assert_close(policy.clip_fraction, out["clip_fraction"], **close)
+    torch.testing.assert_close(policy.ess, out["ESS"], **close)
+    for left, right in zip(gradients(model, whole), gradients(model, total), strict=True):
         torch.testing.assert_close(left, right, **close)
 
 
@@ -266,14 +268,14 @@ def test_equals_stable_baselines3() -> None:
     buffer.full = True
     theirs.train()
 
-    terms = ours(model, batch)
-    steps = torch.autograd.grad(terms.total, mine)
+    whole, policy_part, error = ours(model, batch)
+    steps = torch.autograd.grad(whole, mine)
     for their_part, my_part, gradient in zip(before, mine, steps, strict=True):
         torch.testing.assert_close(their_part, my_part - 0.1 * gradient, rtol=1e-4, atol=1e-6)
     logged = theirs.logger.name_to_value
-    terms = LossTerms(*(term.detach() for term in terms))
-    assert logged["train/policy_gradient_loss"] == pytest.approx(float(terms.policy), rel=1e-4)
-    assert logged["train/value_loss"] == pytest.approx(float(terms.value), rel=1e-4)
+    terms = PolicyLoss(*(term.detach() for term in policy_part))
+    assert logged["train/policy_gradient_loss"] == pytest.approx(float(terms.surrogate), rel=1e-4)
+    assert logged["train/value_loss"] == pytest.approx(float(error.detach()), rel=1e-4)
     assert logged["train/entropy_loss"] == pytest.approx(-float(terms.entropy), rel=1e-4)
     assert logged["train/approx_kl"] == pytest.approx(float(terms.kl), rel=1e-3)
     assert logged["train/clip_fraction"] == pytest.approx(float(terms.clip_fraction))

@@ -145,7 +145,7 @@ def _mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
     return nn.Sequential(*layers, _linear(inputs, outputs))
 
 
-def _linear(inputs: int, outputs: int) -> nn.Linear:
+def _linear(inputs: int, outputs: int) -> nn.Module:
     # skip_init: torch's own start values would draw from the global stream.
     return nn.utils.skip_init(nn.Linear, inputs, outputs)
 

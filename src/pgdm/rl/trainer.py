@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
+
+import torch
 
 from pgdm.errors import CheckpointError
 from pgdm.rl.callback import Callback, Progress
@@ -49,7 +50,7 @@ class TrainerCfg:
     device: str
     """Where the networks are, ``cpu`` or ``cuda``."""
     num_threads: int
-    """Threads of torch while learning; 0: all cores."""
+    """Threads of torch while learning; 0: as many as torch takes by itself."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class Trainer:
         check_batch(cfg.algo, env.num_envs)
         self.env, self.cfg, self.extras = env, cfg, extras or Extras()
         self.model = _build_model(env, cfg)
-        threads = cfg.num_threads or os.cpu_count() or 1
+        threads = cfg.num_threads or torch.get_num_threads()
         self._collector = Collector(
             env, self.model, cfg.algo.steps_per_env, torch_stream(cfg.seed, "actions")
         )
