@@ -73,10 +73,12 @@ def test_the_benchmark_is_the_papers() -> None:
     errors = [task.paper_com_error or 0.0 for task in rated]
     assert sum(success.values()) / 50 == pytest.approx(0.745, abs=5e-4)
     assert sum(errors) / 50 == pytest.approx(5.23e-3, abs=3e-5)  # of rounded figures
+    # For labeled the paper's text says 0.692, but its table of tasks gives 0.607; only the latter
+    # agrees with the mean over all.
     kinds = {
         "mocap": (37, 0.750),
         "teleop": (3, 0.845),
-        "labeled": (7, 0.692),
+        "labeled": (7, 0.607),
         "learned": (3, 0.904),
     }
     for kind, (count, mean) in kinds.items():
