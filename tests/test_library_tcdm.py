@@ -5,6 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -355,6 +358,55 @@ def test_leftovers_of_a_killed_import_are_ignored_and_removed(
     assert open_library(library).hand_xml("adroit").is_file()
     import_tcdm(checkout, library)
     assert sorted(p.name for p in library.iterdir()) == [".lock", "checkout"]
+
+
+def _import_and_die(checkout: str, library: str, steps: int) -> None:
+    seen = [0]
+
+    def die(step: str, done: int, total: int) -> None:
+        seen[0] += 1
+        if seen[0] == steps:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    import_tcdm(Path(checkout), Path(library), die)
+
+
+@pytest.mark.parametrize("steps", [1, 5, 9])
+def test_a_killed_import_changes_nothing_and_leaves_no_lock(
+    checkout: Path, library: Path, steps: int
+) -> None:
+    import_tcdm(checkout, library)
+    before = snapshot(library)
+    write_trajectory(checkout / "trajectories" / "hammer_use1.npz", trajectory(length=4))
+    context = multiprocessing.get_context("spawn")
+    process = context.Process(target=_import_and_die, args=(str(checkout), str(library), steps))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    kept = {k: v for k, v in snapshot(library).items() if not k.startswith(".staging-")}
+    assert kept == before
+    assert open_library(library).entry("hammer-use1").steps == STEPS
+    import_tcdm(checkout, library)
+    assert open_library(library).entry("hammer-use1").steps == 4
+    assert sorted(p.name for p in library.iterdir()) == [".lock", "checkout"]
+
+
+def test_a_full_disk_is_an_error_of_one_line_and_changes_nothing(
+    checkout: Path, library: Path
+) -> None:
+    import_tcdm(checkout, library)
+    before = snapshot(library)
+    program = (
+        "import resource, sys; from pathlib import Path\n"
+        "from pgdm.errors import LibraryError; from pgdm.library import import_tcdm\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))\n"  # no file above 200 bytes
+        "try: import_tcdm(Path(sys.argv[1]), Path(sys.argv[2]))\n"
+        "except LibraryError as error: print(error)\n"
+    )
+    command = [sys.executable, "-c", program, str(checkout), str(library)]
+    answer = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert answer.stdout == f"{library}: cannot be written (File too large)\n"
+    assert snapshot(library) == before
 
 
 def test_the_lock_is_not_waited_for_endlessly(library: Path) -> None:

@@ -125,10 +125,10 @@ ADROIT_WRIST_GAIN, ADROIT_FINGER_GAIN = "5", "1"
 ADROIT_CONTROL_RANGES = {"A_WRJ1": "-0.524 0.175"}
 """Control ranges that differ; the package has two digits."""
 
-ADROIT_POINTS: dict[str, tuple[tuple[str, str, str], ...]] = {
-    "palm": (("wrist_point", "0 0 0", "0.018"),),
+ADROIT_POINTS: dict[str, tuple[str, str, str]] = {
+    "palm": ("wrist_point", "0 0 0", "0.018"),
     **{
-        f"{finger}{part}": ((f"{finger}{point}_point", place, size),)
+        f"{finger}{part}": (f"{finger}{point}_point", place, size)
         for finger in ("ff", "mf", "rf", "lf")
         for part, point, place, size in (
             ("knuckle", "knuckle", "0 0 0", "0.013"),
@@ -136,9 +136,9 @@ ADROIT_POINTS: dict[str, tuple[tuple[str, str, str], ...]] = {
             ("distal", "distal", "0 0 0.01", "0.01"),
         )
     },
-    "thbase": (("thknuckle_point", "0 0 0", "0.017"),),
-    "thmiddle": (("thmiddle_point", "0 0 0", "0.012"),),
-    "thdistal": (("thdistal_point", "0 0 0.01", "0.0115"),),
+    "thbase": ("thknuckle_point", "0 0 0", "0.017"),
+    "thmiddle": ("thmiddle_point", "0 0 0", "0.012"),
+    "thdistal": ("thdistal_point", "0 0 0.01", "0.0115"),
 }
 """The tracked points: by the body that carries them, name, place in it, radius of the sphere.
 

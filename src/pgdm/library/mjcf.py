@@ -6,6 +6,7 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 
+from pgdm.errors import CorruptAssetError
 from pgdm.library import figures
 
 
@@ -69,6 +70,25 @@ def base_actuators(section: ET.Element, gains: Mapping[str, str]) -> None:
             ctrlrange=control,
             kp=gains[name[2]],
         )
+
+
+def carry(root_body: ET.Element, carrier: str, point: ET.Element) -> None:
+    """Put a body with a tracked point into another one, before the bodies that are there.
+
+    Args:
+        root_body: body below which the carrying one lies, or itself.
+        carrier: name of the carrying body.
+        point: what to put there.
+
+    Raises:
+        CorruptAssetError: the carrying body is missing.
+    """
+    for body in root_body.iter("body"):
+        if body.get("name") == carrier:
+            children = [i for i, child in enumerate(body) if child.tag == "body"]
+            body.insert(children[0] if children else len(body), point)
+            return
+    raise CorruptAssetError(f"hand fragments: have no body '{carrier}'")
 
 
 def object_joints(body: ET.Element) -> None:

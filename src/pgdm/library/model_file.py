@@ -11,6 +11,7 @@ from pathlib import Path
 
 from pgdm.errors import CorruptAssetError
 
+_DECLARATION = re.compile(rb"<\?xml[^>]*\?>")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _NUMERIC_NAMES = (
     "pos quat euler axisangle xyaxes zaxis axis range size fromto mass diaginertia fullinertia "
@@ -24,7 +25,7 @@ _DROPPED = frozenset(_DROPPED_NAMES.split())
 trajectory: the first three only bounded memory."""
 
 
-def parse(path: Path, defects: list[str], root: Path) -> ET.Element:
+def parse(path: Path, defects: list[str], root: Path, includes: Path | None = None) -> ET.Element:
     """Parse an MJCF file and put its includes in place.
 
     File attributes become absolute; numbers with a typing error are read as MuJoCo once read them
@@ -34,19 +35,23 @@ def parse(path: Path, defects: list[str], root: Path) -> ET.Element:
         path: the file.
         defects: messages about what was repaired are added here.
         root: folder to which names in messages are relative; includes must not leave it.
+        includes: folder of the included files, by default as the including file says.
 
     Raises:
         CorruptAssetError: a file is missing, damaged, or includes itself or something outside.
     """
-    return _parse(Path(os.path.abspath(path)), defects, Path(os.path.abspath(root)), ())
+    return _parse(Path(os.path.abspath(path)), defects, Path(os.path.abspath(root)), includes, ())
 
 
-def _parse(path: Path, defects: list[str], root: Path, parents: tuple[Path, ...]) -> ET.Element:
+def _parse(
+    path: Path, defects: list[str], root: Path, includes: Path | None, parents: tuple[Path, ...]
+) -> ET.Element:
     label = _label(path, root)
     if path in parents:
         raise CorruptAssetError(f"{label}: includes itself")
     try:
-        element = ET.fromstring(path.read_bytes())
+        # Some files have a comment before their XML declaration, which XML does not allow.
+        element = ET.fromstring(_DECLARATION.sub(b"", path.read_bytes()))
     except ET.ParseError as error:
         raise CorruptAssetError(f"{label}: not well-formed XML ({error})") from error
     except OSError as error:
@@ -57,7 +62,12 @@ def _parse(path: Path, defects: list[str], root: Path, parents: tuple[Path, ...]
         reference = item.get("file")
         if reference is not None:
             item.set("file", str(_inside(path.parent / reference, root, label)))
-    _include(element, lambda target: _parse(Path(target), defects, root, (*parents, path)))
+
+    def load(target: str) -> ET.Element:
+        file = Path(target) if includes is None else includes / Path(target).name
+        return _parse(file, defects, root, includes, (*parents, path))
+
+    _include(element, load)
     return element
 
 

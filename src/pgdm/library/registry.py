@@ -13,6 +13,7 @@ from pgdm.library import (
     package_index,
     staging,
     wheel,
+    wheel_hands,
     wheel_models,
     wheel_motions,
 )
@@ -31,8 +32,9 @@ PACKAGE = Package(
 """The package that holds the data."""
 
 LICENCE_NOTE = (
-    "Models and meshes: Apache-2.0 (robohive, object_sim, Adroit, YCB_sim). The motions derive "
-    "from the GRAB data set, whose licence allows non-commercial research only."
+    "Models and meshes: Apache-2.0 (robohive with object_sim, Adroit, robel_sim, dmanus_sim, "
+    "YCB_sim). The motions derive from the GRAB data set, whose licence allows non-commercial "
+    "research only."
 )
 """Said once when the data is fetched."""
 
@@ -46,7 +48,10 @@ _WANTED = re.compile(
     rf"|{_SIMS}/scene_sim/meshes/(wall|skyline)\.stl"
     rf"|{_SIMS}/furniture_sim/common/textures/stone1\.png"
     rf"|{_SIMS}/YCB_sim/(meshes|textures)/(002_master_chef_can|003_cracker_box)\.(msh|png)"
-    rf"|{_SIMS}/(object_sim|Adroit|scene_sim|furniture_sim|YCB_sim)/LICENSE"
+    rf"|{_SIMS}/robel_sim/dhand/(assets/[a-z_]+\.xml|meshes/[^/]+\.stl)"
+    rf"|{_SIMS}/dmanus_sim/(assets/[a-z_]+\.xml|meshes/(highres|convex)/[^/]+\.stl)"
+    rf"|{_SIMS}/(object|furniture|scene|YCB|robel|dmanus)_sim/LICENSE"
+    rf"|{_SIMS}/Adroit/LICENSE"
     rf"|{_TCDM}/data/Adroit_[a-z0-9_]+\.npz"
     rf"|{_TCDM}/tmp_data/({'|'.join(map(re.escape, wheel_motions.EXPERT_FILES))})"
     r"|[^/]+\.dist-info/LICENSE"
@@ -94,15 +99,13 @@ def _licence_of(origin: str) -> str:
 
 
 def _add_models(builder: SourceBuilder, sims: Path, progress: Progress) -> None:
-    builder.add_model(
-        "scene", "table", wheel_models.table_scene(sims), sims / "scene_sim" / "LICENSE"
-    )
-    builder.add_model(
-        "hands",
-        "adroit",
-        wheel_models.adroit(sims, builder.defects),
-        sims / "Adroit" / "resources" / "chain.xml",
-    )
+    builder.add_model("scene", "table", wheel_models.table_scene(sims), sims / "scene_sim")
+    for name, make, origin in (
+        ("adroit", wheel_models.adroit, "Adroit/resources/chain.xml"),
+        ("dhand", wheel_hands.dhand, "robel_sim/dhand/assets/dhand_chain.xml"),
+        ("dmanus", wheel_hands.dmanus, "dmanus_sim/assets/dmanus_chain.xml"),
+    ):
+        builder.add_model("hands", name, make(sims, builder.defects), sims / origin)
     names = sorted(p.parent.name for p in (sims / "object_sim").glob("*/body.xml"))
     for i, name in enumerate(names):
         progress("objects", i, len(names))
@@ -110,7 +113,7 @@ def _add_models(builder: SourceBuilder, sims: Path, progress: Progress) -> None:
         builder.add_model("objects", name, model, sims / "object_sim" / name / "body.xml")
     for name in figures.YCB_OBJECTS:
         model = wheel_models.ycb_object(sims, name)
-        builder.add_model("objects", name, model, sims / "YCB_sim" / "LICENSE")
+        builder.add_model("objects", name, model, sims / "YCB_sim")
     progress("objects", len(names), len(names))
 
 

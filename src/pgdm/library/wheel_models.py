@@ -204,27 +204,15 @@ def _adroit_body(forearm: ET.Element) -> None:
             item.set("quat", mjcf.normalised(item.attrib["quat"]))
         if item.tag == "joint" and "." in item.get("axis", ""):
             item.set("axis", mjcf.normalised(item.attrib["axis"]))
-    add_points(forearm, figures.ADROIT_POINTS)
+    _add_points(forearm)
 
 
-def add_points(root_body: ET.Element, points: dict[str, tuple[tuple[str, str, str], ...]]) -> None:
-    """Put the tracked points into the bodies that carry them, before these bodies' own children.
-
-    Raises:
-        CorruptAssetError: a carrying body is missing.
-    """
-    bodies = {b.get("name"): b for b in root_body.iter("body")}
-    for carrier, carried in points.items():
-        if carrier not in bodies:
-            raise CorruptAssetError(f"hand fragments: have no body '{carrier}'")
-        body = bodies[carrier]
-        children = [i for i, child in enumerate(body) if child.tag == "body"]
-        at = children[0] if children else len(body)
-        for name, place, size in reversed(carried):
-            point = ET.Element("body", name=name, pos=place)
-            look = {"type": "sphere", "size": size, "rgba": "1 0 0 0"}
-            mjcf.add(point, "geom", name=name, contype="0", conaffinity="0", **look)
-            body.insert(at, point)
+def _add_points(forearm: ET.Element) -> None:
+    look = {"type": "sphere", "rgba": "1 0 0 0", "contype": "0", "conaffinity": "0"}
+    for carrier, (name, place, size) in figures.ADROIT_POINTS.items():
+        point = ET.Element("body", name=name, pos=place)
+        mjcf.add(point, "geom", name=name, size=size, **look)
+        mjcf.carry(forearm, carrier, point)
 
 
 def _adroit_pairs(root: ET.Element, parts: ET.Element, forearm: ET.Element) -> None:
