@@ -83,6 +83,13 @@ def reference(points: list, quats: list | None = None) -> ObjectReference:
 CFG = MetricsCfg(success_threshold_m=0.01, lift_height_m=0.02)
 
 
+def test_corrected_targets_are_those_of_the_centre_of_mass() -> None:
+    # The centre of mass lies 1 cm along the body's x; a quarter turn about z makes that world y.
+    ref = reference([[1.0, 2.0, 3.0]] * 2, [IDENTITY, QUARTER_Z])
+    corrected = ref.com_corrected(double([0.01, 0.0, 0.0]))
+    torch.testing.assert_close(corrected.pos, double([[1.01, 2.0, 3.0], [1.0, 2.01, 3.0]]))
+
+
 def test_metrics_of_a_steady_two_millimetre_error() -> None:
     # SPEC 1: over 85 steps the released error is 2e-3 sqrt(85) / 85 = 2.169e-4.
     ref = reference([[0.0, 0.0, 0.0]] * 86)

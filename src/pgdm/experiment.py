@@ -55,7 +55,7 @@ class RunResult:
 
 def env_builder(cfg: ExperimentCfg, library: Library) -> EnvBuilder:
     """Compile the task of an experiment."""
-    env = EnvCfg(cfg.task, cfg.hand, cfg.sim, cfg.pregrasp, cfg.obs, cfg.action)
+    env = EnvCfg(cfg.task, cfg.hand, cfg.sim, cfg.pregrasp, cfg.obs, cfg.action, cfg.reference)
     return EnvBuilder(library, env, recipe(cfg.method))
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_GROUPS = ("pregrasp", "obs", "action", "method", "ablation", "hand", "sim")
+_GROUPS = ("pregrasp", "obs", "action", "reference", "method", "ablation", "hand", "sim")
 
 
 def make_batch(

@@ -10,6 +10,7 @@ from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.mdp.actions import ActionCfg
 from pgdm.mdp.observations import ObsCfg
 from pgdm.methods import METHODS, MethodCfg
+from pgdm.motion.reference import FRAMES, ReferenceCfg
 from pgdm.pregrasp.sources import SOURCES, PregraspCfg
 from pgdm.rl.checkpoint import CheckpointCfg
 from pgdm.rl.evaluate import EvalCfg
@@ -44,6 +45,8 @@ class ExperimentCfg:
     """What the policy sees."""
     action: ActionCfg
     """What an action means."""
+    reference: ReferenceCfg
+    """How the stored motion becomes targets."""
     algo: PPOCfg
     """How the policy learns."""
     sim: SimCfg
@@ -138,6 +141,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "ablation.name": ("none",),
     "obs.layout": ("released", "paper"),
     "action.kind": ("absolute", "residual"),
+    "reference.frame": FRAMES,
     "hand.gravity_compensation": ("all", "base"),
     "tracking.kind": ("mlflow", "none"),
     "resume": ("auto", "never", "must"),

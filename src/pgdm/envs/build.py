@@ -8,11 +8,12 @@ from pathlib import Path
 import torch
 
 from pgdm.envs.batch_env import BatchEnv, Mdp
+from pgdm.errors import UnknownNameError
 from pgdm.library import Library
 from pgdm.mdp.actions import ActionCfg, action_map
 from pgdm.mdp.observations import ObsCfg, layout
 from pgdm.mdp.recipe import Recipe
-from pgdm.motion.reference import ObjectReference
+from pgdm.motion.reference import FRAMES, ObjectReference, ReferenceCfg
 from pgdm.pregrasp.sources import PregraspCfg, start_state
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.randomize import Randomizer
@@ -29,6 +30,7 @@ class EnvCfg:
     pregrasp: PregraspCfg
     obs: ObsCfg
     action: ActionCfg
+    reference: ReferenceCfg
 
 
 class EnvBuilder:
@@ -43,8 +45,8 @@ class EnvBuilder:
         self.scene: Scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
         self.motion = library.motion(cfg.task.motion)
         start = start_state(cfg.pregrasp, self.motion, self.scene)
-        reference = ObjectReference.of(self.motion)
         index = self.scene.index
+        reference = _reference(cfg.reference, ObjectReference.of(self.motion), self.scene)
         self.mdp = Mdp(
             reference=reference,
             start=start,
@@ -65,3 +67,12 @@ class EnvBuilder:
         sim = SimBatch(self.scene, num_envs, num_threads, self.motion.substeps)
         randomize = Randomizer(seed, num_envs) if self.scene.task.randomize else None
         return BatchEnv(sim, self.mdp, randomize, auto_reset, dump_dir)
+
+
+def _reference(cfg: ReferenceCfg, stored: ObjectReference, scene: Scene) -> ObjectReference:
+    if cfg.frame not in FRAMES:
+        raise UnknownNameError("reference frame", cfg.frame, FRAMES)
+    if cfg.frame == "released":
+        return stored
+    com = scene.model.body_ipos[scene.index.object_body].copy()
+    return stored.com_corrected(torch.from_numpy(com))

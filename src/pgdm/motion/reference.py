@@ -7,12 +7,26 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pgdm import rotations
 from pgdm.library import Motion
 
 # Steps ahead whose targets the agent sees (R, reference motion goals).
 GOAL_STEPS = (1, 5, 10)
 # Frequencies of the positional encoding of time (R).
 TIME_FREQUENCIES = (1, 4, 6, 8)
+
+
+@dataclass(frozen=True)
+class ReferenceCfg:
+    """How the stored poses become targets."""
+
+    frame: str
+    """``released``: the stored position is the centre of mass's target, as published;
+    ``com_corrected``: it is that of the mesh's origin, as recorded, and the target is where the
+    centre of mass then lies."""
+
+
+FRAMES = ("released", "com_corrected")
 
 
 @dataclass(frozen=True)
@@ -28,6 +42,15 @@ class ObjectReference:
     def of(cls, motion: Motion) -> ObjectReference:
         """Take the trajectory of a stored motion."""
         return cls(torch.as_tensor(motion.translation), torch.as_tensor(motion.orientation))
+
+    def com_corrected(self, com: Tensor) -> ObjectReference:
+        """Return targets of the centre of mass for poses that are those of the body's origin.
+
+        Args:
+            com: (3,) m, the centre of mass in the body's frame.
+        """
+        offset = rotations.rotate(self.quat, com.expand_as(self.pos))
+        return ObjectReference(self.pos + offset, self.quat)
 
     def __len__(self) -> int:
         """Return T, the number of poses; an episode has at most T-1 steps."""
