@@ -100,8 +100,9 @@ def test_show_tells_provenance_licence_hash_and_defect(
     assert "defect: tcdm/envs/assets/robots/dmanus/base.xml" in out
     motion = [line for line in out.splitlines() if "motions/dmanus-cup.npz" in line]
     assert "sha256" in motion[0]
-    assert "MIT, motions derived from GRAB" in motion[0]
+    assert "  MIT  from trajectories/dmanus_cup.npz" in motion[0]
     _, out, _ = run(capsys, "show", "hammer-use1")
+    assert "  MIT, motions derived from GRAB  from trajectories/hammer_use1.npz" in out
     assert "defect" not in out  # it is not in Adroit's file
 
 

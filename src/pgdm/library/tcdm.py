@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pgdm.errors import CorruptAssetError, LibraryError
-from pgdm.library import manifest, model_file, motion_file, names, safe_npz, staging
+from pgdm.library import figures, manifest, model_file, motion_file, names, safe_npz, staging
 from pgdm.library.builder import SourceBuilder
 from pgdm.library.motion_file import Start
 from pgdm.library.report import Progress, Report, silent
@@ -20,7 +20,18 @@ from pgdm.library.report import Progress, Report, silent
 _STARTS = {"motion_planned": "planned", "initialized": "mined", "learned": "learned"}
 """TCDM's names of the start states and ours."""
 
-_LICENCES = {"meshes": "Apache-2.0", "trajectories": "MIT, motions derived from GRAB"}
+_GRAB_LICENCE = "MIT, motions derived from GRAB"
+_GRAB_COPIES = frozenset(
+    {
+        "dhand-alarmclock",
+        "dhand-binoculars",
+        "dhand-cup",
+        "dhand-elephant",
+        "dhand-waterbottle",
+        "dmanus-coffeecan",
+    }
+)
+"""Tasks of other hands whose object moves as in a motion-capture task, exactly or slightly altered."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +116,9 @@ def _refuse_loss(root: Path, report: Report, replace: bool) -> None:
 
 def _licence_of(origin: str) -> str:
     if origin.endswith(".npz"):
-        return _LICENCES["trajectories"]
-    return _LICENCES["meshes"] if "meshes/" in origin else "MIT"
+        task = names.task_id(Path(origin).stem)
+        return _GRAB_LICENCE if task in figures.GRAB_TASKS or task in _GRAB_COPIES else "MIT"
+    return "Apache-2.0" if "meshes/" in origin else "MIT"
 
 
 def _add_models(tree: Tree, builder: SourceBuilder, progress: Progress) -> None:
