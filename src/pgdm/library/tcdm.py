@@ -31,7 +31,7 @@ _GRAB_COPIES = frozenset(
         "dmanus-coffeecan",
     }
 )
-"""Tasks of other hands whose object moves as in a motion-capture task, exactly or slightly altered."""
+"""Tasks of other hands whose object moves as in a motion-capture task, or nearly so."""
 
 
 @dataclass(frozen=True)
