@@ -432,3 +432,12 @@ def test_every_checkpoint_of_a_run_is_damaged(home: Path, tmp_path: Path) -> Non
     with unchanged(tmp_path / "run" / "checkpoints", tmp_path / "run" / "config.yaml"):
         outcome = command("pgdm-run", "--offline", *longer)
         assert_helps(outcome, "checkpoints", "start anew in another run_dir", code=1)
+
+
+@pytest.mark.parametrize("name", ["objects/hammer/object.xml", "hands/adroit/hand.xml"])
+def test_a_damaged_model(home: Path, name: str) -> None:
+    file = home / "library" / "checkout" / name
+    replace_file(file, b"<mujoco><body></mujoco>")
+    with unchanged(home):
+        outcome = command("pgdm-run", "--offline", *TINY, "run_dir=run")
+        assert_helps(outcome, file.name, code=1)

@@ -67,7 +67,7 @@ def test_what_is_not_there_is_named_with_what_is(filled: Path) -> None:
         library.motion("hammer-use2")
     with pytest.raises(UnknownNameError, match="unknown hand 'adroyt'; did you mean adroit"):
         library.hand_xml("adroyt")
-    with pytest.raises(UnknownNameError, match=r"unknown object 'x' Valid: cup, hammer\."):
+    with pytest.raises(UnknownNameError, match=r"unknown object 'x'; valid: cup, hammer\."):
         library.object_xml("x")
     with pytest.raises(UnknownNameError, match=r"unknown library source 'registry' .*checkout"):
         library.scene_xml("registry")

@@ -29,8 +29,10 @@ class UnknownNameError(ConfigError):
         close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.5)
         shown = names if len(names) <= 12 else [*names[:12], f"... ({len(names)} in all)"]
         message = f"unknown {kind} '{name}'"
-        message += f"; did you mean {' or '.join(close)}?" if close else ""
-        message += f" Valid: {', '.join(shown)}." if names and not close else ""
+        if close:
+            message += f"; did you mean {' or '.join(close)}?"
+        elif names:
+            message += f"; valid: {', '.join(shown)}."
         super().__init__(f"{message} {hint}".rstrip())
         self.name, self.valid = name, names
 

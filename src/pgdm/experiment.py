@@ -20,6 +20,8 @@ from pgdm.envs.build import EnvBuilder, EnvCfg
 from pgdm.envs.film import film_policy
 from pgdm.errors import PgdmError, RenderError, RunError
 from pgdm.library import Library, ensure
+from pgdm.library.provide import Spoken
+from pgdm.library.report import Progress as FetchProgress
 from pgdm.methods import recipe
 from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder
@@ -83,7 +85,8 @@ def run_experiment(
     """
     run_dir = Path(cfg.run_dir)
     _check_folder(cfg, run_dir)
-    library = ensure(cfg.task.motion, cfg.offline, notify)
+    progress = _stoppable(stop, Spoken(notify))
+    library = ensure(cfg.task.motion, cfg.offline, notify, progress=progress)
     with _locked(run_dir):
         builder = env_builder(cfg, library)
         return Run(cfg, builder, run_dir, notify).train(callbacks, stop)
@@ -262,6 +265,17 @@ class Run(Callback):
             video=self.dir / video if video else None,
             asset_source=stored["asset_source"],
         )
+
+
+def _stoppable(stop: Callable[[], bool], inner: FetchProgress) -> FetchProgress:
+    """Let a fetch end at a stop request; what was downloaded stays for the next time."""
+
+    def progress(step: str, done: int, total: int) -> None:
+        if stop():
+            raise KeyboardInterrupt
+        inner(step, done, total)
+
+    return progress
 
 
 def _check_folder(cfg: ExperimentCfg, run_dir: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -122,14 +123,14 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
         LibraryError: if the library lacks an asset.
     """
     source = library.source_of(task.motion)
-    spec = mujoco.MjSpec.from_file(str(library.scene_xml(source)))
+    spec = _load(library.scene_xml(source))
     spec.option.timestep = task.timestep_s
     spec.option.iterations = sim.solver_iterations
     spec.option.noslip_iterations = sim.noslip_iterations
     files = [library.hand_xml(hand.name, source)]
     files += [library.object_xml(name, source) for name in task.objects]
     for file in files:
-        child = mujoco.MjSpec.from_file(str(file))
+        child = _load(file)
         frame = spec.worldbody.add_frame()
         spec.attach(child, frame=frame, prefix=f"{child.modelname}/")
     for placement in task.placements:
@@ -140,6 +141,17 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
     except ValueError as error:
         raise SceneError(f"the scene of task '{task.id}' does not compile: {error}") from error
     return Scene(model, _index(model, task, hand, randomized), task, hand, source)
+
+
+def _load(file: Path) -> mujoco.MjSpec:
+    try:
+        return mujoco.MjSpec.from_file(str(file))
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise SceneError(
+            f"{file} is damaged ({reason}); 'pgdm assets verify' lists what else is, "
+            "'pgdm assets fetch' or 'pgdm assets import PATH' makes it anew"
+        ) from error
 
 
 def _place(spec: mujoco.MjSpec, placement: PlacementCfg) -> None:
