@@ -105,7 +105,9 @@ def test_a_run_as_mlflow_shows_it(tmp_path: Path) -> None:
     assert run.info.end_time >= run.info.start_time
     assert run.info.run_name == "hammer-use1 s0 pgdm ppo_fast residual"
     tags = {k: v for k, v in run.data.tags.items() if not k.startswith("mlflow.")}
-    assert tags == {**RunFolder(folder.path).tags(), "attempts": "1"}
+    synced = RunFolder(folder.path).fingerprint()
+    assert tags == {**RunFolder(folder.path).tags(), "attempts": "1", "synced": synced}
+    assert run.data.tags["mlflow.source.git.commit"] == "0123abc"
     assert tags["git"] == "0123abc"  # from the result; unknown at the start
     assert "| `com_error` | m |" in run.data.tags["mlflow.note.content"]
     params = flatten({k: v for k, v in config().items() if k not in ("run_dir", "resume")})

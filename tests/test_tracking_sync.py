@@ -93,6 +93,9 @@ def test_what_a_live_run_missed_is_completed(root: Path) -> None:
         tracker.log({k: float(v) for k, v in record.items() if "/" in k}, int(record["frames"]))
     tracker.finish("finished")
     run_id = read_json(folder.path / LINK)["run_id"]
+    end(folder)
+    assert actions(root) == {"a": "completed"}  # its end was not known when it finished
+    assert actions(root) == {"a": "unchanged"}
     train(folder, 6, 10)  # and now MLflow was away
     end(folder, "failed")
     assert actions(root) == {"a": "completed"}

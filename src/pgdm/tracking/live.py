@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
-from pgdm.tracking.mlflow import Mirror, Point, Store, Thin, find_run, points, store_uri
+from pgdm.tracking.mlflow import SYNCED, Mirror, Point, Store, Thin, find_run, points, store_uri
 from pgdm.tracking.run_folder import FACTS, RunFolder, runs_root
 from pgdm.tracking.tracker import Tracker, TrackingCfg
 
@@ -143,6 +143,6 @@ class MlflowTracker(Tracker):
         mirror = self._connected()
         self._folder = RunFolder(self._folder.path)  # with the result that was written since
         mirror.refresh(self._folder)
-        mirror.describe({})
+        mirror.describe({SYNCED: self._folder.fingerprint()})
         mirror.artifacts()
         mirror.set_status(status, time.time())

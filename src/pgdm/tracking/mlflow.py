@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 DATABASE = "mlflow.db"
 MAX_POINTS = 1500
 """Points of one metric in MLflow at most, whose pages get slow beyond; the run log keeps all."""
+SYNCED = "synced"
+"""Tag with the fingerprint of the records that are in MLflow, all of them."""
 STATUS = {
     "running": "RUNNING",
     "finished": "FINISHED",
@@ -193,6 +195,8 @@ class Mirror:
         texts = {**self._folder.tags(), **tags, **changed}
         texts["mlflow.note.content"] = f"`{self._folder.path}`\n\n{metric_names.markdown()}"
         texts["mlflow.source.name"] = "pgdm-run"
+        if "git" in texts:
+            texts["mlflow.source.git.commit"] = texts["git"].rstrip("+")
         all_tags = [RunTag(name, text) for name, text in texts.items()]
         self._client.log_batch(self.run_id, tags=all_tags)
         for start in range(0, len(new), _PARAMS):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import time
@@ -144,6 +145,13 @@ class RunFolder:
         if lines:
             times.append(log.stat().st_mtime - float(lines[-1].get("time_s", 0.0)))
         return min(times)
+
+    def fingerprint(self) -> str:
+        """Return a text that changes with the run's records and result."""
+        digest = hashlib.sha256()
+        for file in (self.log.path, self.path / RESULT):
+            digest.update(file.read_bytes() if file.exists() else b"-")
+        return digest.hexdigest()[:16]
 
     def artifacts(self) -> list[tuple[Path, str]]:
         """Return the files worth a copy elsewhere, each with the folder it belongs in."""

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from pgdm.errors import RunError, TrackingError
-from pgdm.tracking.mlflow import Mirror, Store, find_run, points, store_uri
-from pgdm.tracking.run_folder import RESULT, RunFolder, find_runs
+from pgdm.tracking.mlflow import SYNCED, Mirror, Store, find_run, points, store_uri
+from pgdm.tracking.run_folder import RunFolder, find_runs
 from pgdm.tracking.run_log import metrics_of
 
 EXPERIMENT = "pgdm"
 """Where runs go whose configuration names no experiment."""
-_FINGERPRINT = "synced"
 
 
 @dataclass(frozen=True)
@@ -69,10 +67,10 @@ def _sync_run(store: Store, folder: RunFolder) -> Synced:
     status = folder.status()
     if run is not None and status == "running":
         return Synced(folder, "running")
-    fingerprint = _fingerprint(folder)
+    fingerprint = folder.fingerprint()
     action = "created" if run is None else "completed"
     wanted = points(folder, folder.log.read())
-    if run is not None and run.data.tags.get(_FINGERPRINT) == fingerprint:
+    if run is not None and run.data.tags.get(SYNCED) == fingerprint:
         action, wanted = "unchanged", []
     elif run is not None:
         there = _history(store, run.info.run_id, run.data.metrics)
@@ -87,7 +85,7 @@ def _sync_run(store: Store, folder: RunFolder) -> Synced:
         mirror.posters()
     if action != "unchanged":
         mirror.link({})
-        mirror.describe({_FINGERPRINT: fingerprint})
+        mirror.describe({SYNCED: fingerprint})
         mirror.set_status(status, folder.modified())
     mirror.artifacts()
     return Synced(folder, action)
@@ -120,10 +118,3 @@ def _missing(
     there: dict[str, dict[int, float]], step: int, metrics: dict[str, float]
 ) -> dict[str, float]:
     return {name: value for name, value in metrics.items() if step not in there.get(name, {})}
-
-
-def _fingerprint(folder: RunFolder) -> str:
-    digest = hashlib.sha256()
-    for file in (folder.log.path, folder.path / RESULT):
-        digest.update(file.read_bytes() if file.exists() else b"-")
-    return digest.hexdigest()[:16]
