@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import logging
+import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from library_trees import make_checkout
 from pgdm.errors import LibraryError, UnknownNameError
-from pgdm.library import ensure, figures, import_tcdm, names, open_library, provide
+from pgdm.library import ensure, figures, import_tcdm, names, open_library, provide, staging
 from pgdm.library.provide import Spoken
 
 
@@ -21,10 +24,24 @@ def test_what_is_there_is_not_fetched(tmp_path: Path) -> None:
     assert said == []
 
 
+def test_what_another_process_fills_meanwhile_is_not_fetched_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("PIP_NO_INDEX", "1")  # a fetch would fail
+    filled, library = tmp_path / "filled", tmp_path / "library"
+    import_tcdm(make_checkout(tmp_path / "TCDM"), filled)
+    with ThreadPoolExecutor() as pool:
+        with staging.locked(library):
+            waiting = [pool.submit(ensure, "hammer-use1", False, None, library) for _ in range(2)]
+            deadline = time.monotonic() + 30
+            while caplog.text.count("waiting for it") < 2 and time.monotonic() < deadline:
+                time.sleep(0.05)
+            shutil.copytree(filled / "checkout", library / "checkout")
+        assert [w.result(timeout=30).source_of("hammer-use1") for w in waiting] == ["checkout"] * 2
+
+
 def test_offline_refuses_with_the_cure(tmp_path: Path) -> None:
-    with pytest.raises(
-        LibraryError, match=r"--offline forbids fetching it; run 'pgdm assets"
-    ):
+    with pytest.raises(LibraryError, match=r"--offline forbids fetching it; run 'pgdm assets"):
         ensure("cup-pour1", True, root=tmp_path / "library")
     assert list(tmp_path.iterdir()) == []
 

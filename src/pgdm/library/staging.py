@@ -28,8 +28,12 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def locked(root: Path, timeout_s: float = 600.0) -> Iterator[None]:
-    """Hold the library's lock.
+def locked(root: Path, timeout_s: float = 3600.0) -> Iterator[None]:
+    """Hold the library's lock, which is not to be asked for again while it is held.
+
+    Args:
+        root: the library.
+        timeout_s: how long to wait for another process; a fetch over a slow line takes its time.
 
     Raises:
         LibraryError: the folder cannot be written, or another import holds the lock too long.
@@ -37,8 +41,15 @@ def locked(root: Path, timeout_s: float = 600.0) -> Iterator[None]:
     try:
         root.mkdir(parents=True, exist_ok=True)
         lock = FileLock(str(root / ".lock"))
-        with lock.acquire(timeout=timeout_s):
+        try:
+            lock.acquire(timeout=0.2)
+        except Timeout:
+            _log.warning("another process is filling the library in %s: waiting for it", root)
+            lock.acquire(timeout=timeout_s)
+        try:
             yield
+        finally:
+            lock.release()
     except Timeout as error:
         raise LibraryError(
             f"{root}: another import has held the library's lock for {timeout_s:.0f} s; "
