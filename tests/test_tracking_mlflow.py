@@ -24,7 +24,7 @@ from fake_runs import (
     train_metrics,
 )
 from pgdm.errors import UnknownNameError
-from pgdm.tracking import NullTracker, RunFolder, Tracker, TrackingCfg, open_tracker
+from pgdm.tracking import NullTracker, RunFolder, Tracker, TrackingCfg, metric_names, open_tracker
 from pgdm.tracking.mlflow import MAX_POINTS, Mirror, Store, Thin, find_run, store_uri
 from pgdm.tracking.run_folder import LINK, flatten, read_json
 
@@ -305,3 +305,8 @@ def test_link_is_json_that_people_can_read(tmp_path: Path) -> None:
     link = json.loads((folder.path / LINK).read_text())
     assert set(link) == {"attempts", "asset_source", "run_id", "uri"}
     assert link["uri"] == f"sqlite:///{tmp_path}/runs/mlflow.db"
+
+
+def test_the_docs_explain_every_metric() -> None:
+    page = Path(__file__).parents[1] / "docs" / "tracking.md"
+    assert metric_names.markdown() in page.read_text(encoding="utf-8")
