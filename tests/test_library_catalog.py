@@ -69,7 +69,7 @@ def test_what_is_not_there_is_named_with_what_is(filled: Path) -> None:
         library.hand_xml("adroyt")
     with pytest.raises(UnknownNameError, match=r"unknown object 'x'; valid: cup, hammer\."):
         library.object_xml("x")
-    with pytest.raises(UnknownNameError, match=r"unknown library source 'registry' .*checkout"):
+    with pytest.raises(UnknownNameError, match=r"unknown library source 'registry'; .*checkout"):
         library.scene_xml("registry")
 
 
