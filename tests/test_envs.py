@@ -59,6 +59,15 @@ def test_choices_of_start_observation_and_action(pregrasp: str, obs: str, action
     env.step(env.warm_start()[None])
 
 
+def test_another_hand_starts_from_its_reset_pose() -> None:
+    env = pgdm.make_batch("hammer-use1", num_envs=1, num_threads=1, hand="dhand", pregrasp="none")
+    adroit = pgdm.make_batch("hammer-use1", num_envs=1, num_threads=1, pregrasp="mined")
+    assert env.action_dim == 24
+    torch.testing.assert_close(env.sim.read().qpos[0, 24:], adroit.sim.read().qpos[0, 30:])
+    with pytest.raises(ConfigError, match="pregrasp=none"):
+        pgdm.make_batch("hammer-use1", num_envs=1, hand="dhand", pregrasp="mined")
+
+
 def test_learned_starts_exist_in_three_tasks() -> None:
     found = []
     for task in ("alarmclock-see1", "duck-inspect1", "stanfordbunny-inspect1"):

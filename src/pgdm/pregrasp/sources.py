@@ -55,14 +55,18 @@ def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
             f"it has: {', '.join(sorted(motion.starts))} (pregrasp=...). Stored plans come with a "
             f"TCDM checkout: pgdm assets import PATH"
         )
-    start = motion.starts[wanted]
+    start, model = motion.starts[wanted], scene.model
     qpos, qvel = np.array(start.qpos), np.array(start.qvel)
-    if qpos.shape != (scene.model.nq,) or qvel.shape != (scene.model.nv,):
+    if source == "none":
+        # Only the objects' joints, last in qpos, are taken: the hand may be another than the
+        # stored start's.
+        objects = qpos[len(qpos) - (model.nq - model.nu) :]
+        qpos = np.concatenate((np.zeros(model.nu), objects))
+        qvel = np.zeros(model.nv)
+    if qpos.shape != (model.nq,) or qvel.shape != (model.nv,):
         raise ConfigError(
             f"start '{wanted}' of motion '{motion.id}' has {qpos.size} positions and {qvel.size} "
-            f"velocities, the scene of '{scene.task.id}' has {scene.model.nq} and {scene.model.nv}"
+            f"velocities, the scene of '{scene.task.id}' with hand '{scene.hand.name}' has "
+            f"{model.nq} and {model.nv}; pregrasp=none starts any hand from its reset pose"
         )
-    if source == "none":
-        qpos[: scene.model.nu] = 0.0
-        qvel[:] = 0.0
     return StartState(source, qpos, qvel)
