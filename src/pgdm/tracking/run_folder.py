@@ -43,6 +43,8 @@ TAGS = {
 FACTS = ("asset_source", "pregrasp_used", "motion_sha256", "git")
 """What only the run itself knew, kept in ``result.json`` and ``mlflow.json``."""
 
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
 
 class RunFolder:
     """One run's folder; nothing is read before it is asked for.
@@ -64,7 +66,7 @@ class RunFolder:
         """
         file = self.path / CONFIG
         try:
-            config = yaml.safe_load(file.read_text())
+            config = yaml.load(file.read_text(), Loader=_LOADER)  # as safe, and faster in C
         except (OSError, ValueError, yaml.YAMLError) as error:
             raise RunError(f"cannot read {file}: {_first_line(error)}") from error
         if not isinstance(config, dict):
