@@ -35,7 +35,7 @@ _STOPPERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 def dashboard(
     root: Annotated[
-        Path | None, typer.Argument(metavar="[DIR]", help="Folder of runs [runs].")
+        Path | None, typer.Argument(metavar="DIR", help="Folder of runs [runs].")
     ] = None,
     port: Annotated[int, typer.Option(help="Port; another one is taken if it is in use.")] = 5000,
     uri: Annotated[

@@ -53,7 +53,7 @@ class _ListByDefault(TyperGroup):
 
 app = typer.Typer(cls=_ListByDefault, help="Show local runs; `sync` rebuilds MLflow from them.")
 
-Root = Annotated[Path | None, typer.Argument(metavar="[DIR]", help="Folder of runs [runs].")]
+Root = Annotated[Path | None, typer.Argument(metavar="DIR", help="Folder of runs [runs].")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs, not a table.")]
 Uri = Annotated[str | None, typer.Option(help="MLflow store to fill, such as http://host:5000.")]
 

@@ -83,8 +83,10 @@ class Store:
         os.environ.update({k: v for k, v in _SETTINGS.items() if k not in os.environ})
         from mlflow import MlflowClient
 
-        for name in ("mlflow", "alembic"):  # they announce each step of making a database
-            logging.getLogger(name).setLevel(logging.WARNING)
+        # The first two announce each step of making a database; the third one's complaints come
+        # to us as errors as well.
+        for name, level in (("mlflow", "WARNING"), ("alembic", "WARNING"), ("urllib3", "ERROR")):
+            logging.getLogger(name).setLevel(level)
         file = sqlite_file(uri)
         with _only_one(file):
             client = MlflowClient(tracking_uri=uri)

@@ -56,7 +56,7 @@ def sync(
             outcome = Synced(folder, "unreadable", str(error))
         except (MlflowException, OSError) as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise TrackingError(f"MLflow refused {folder.path}: {reason}") from error
+            raise TrackingError(f"MLflow at {place}, run {folder.path}: {reason}") from error
         notify(outcome)
         done.append(outcome)
     return done
