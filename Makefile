@@ -24,21 +24,24 @@ SOURCES := pyproject.toml constraints.txt
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' $(firstword $(MAKEFILE_LIST))
 
-# pip and the stamps are written last, so an interrupted installation is taken up again.
-$(BIN)/pip:
+# The stamps are written last, so an interrupted installation is taken up again. pip is brought to
+# one version too: `pgdm assets fetch` asks it where files lie, and old ones download to answer.
+$(VENV)/.pip:
 	@test -n "$(PYTHON)" || { echo "No python3 found: install Python 3.11 or newer."; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "$(PYTHON) is too old: pgdm needs Python 3.11 or newer. Name one with PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null \
 		|| { echo "$(PYTHON) cannot make environments: on Debian, apt-get install python3-venv."; exit 1; }
 	$(PYTHON) -m venv $(VENV)
+	$(INSTALL) --upgrade pip
+	@touch $@
 
-$(VENV)/.run: $(SOURCES) | $(BIN)/pip
+$(VENV)/.run: $(SOURCES) | $(VENV)/.pip
 	@echo "Installing into $(VENV) (a few minutes, once)"
 	$(INSTALL) --editable .
 	@touch $@
 
-$(VENV)/.dev: $(SOURCES) | $(BIN)/pip
+$(VENV)/.dev: $(SOURCES) | $(VENV)/.pip
 	@echo "Installing into $(VENV), development tools included (a few minutes, once)"
 	$(INSTALL) --editable '.[dev]'
 	@touch $@ $(VENV)/.run

@@ -82,7 +82,7 @@ def test_every_requirement_is_pinned_within_its_range() -> None:
     Path(sys.prefix) != REPOSITORY / ".venv", reason="holds in the environment that make sets up"
 )
 def test_the_pins_are_the_environment() -> None:
-    unpinned = {"pip", "setuptools", "wheel", "pgdm"}
+    unpinned = {"setuptools", "wheel", "pgdm"}
     installed = {
         canonicalize_name(d.metadata["Name"]): Version(d.version).public
         for d in metadata.distributions()
