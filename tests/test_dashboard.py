@@ -73,9 +73,9 @@ def served(folder: RunFolder, tmp_path: Path) -> Iterator[tuple[subprocess.Popen
     found = re.search(rf"http://{HOST}:\d+/\S+", "".join(lines))
     assert found, lines
     yield process, found.group()
-    process.kill()
+    process.send_signal(signal.SIGINT)  # a killed one could not end its server
+    process.wait(60)
     process.stdout.close()
-    process.wait()
 
 
 def group_of(port: int) -> list[int]:
