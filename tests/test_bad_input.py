@@ -441,3 +441,9 @@ def test_a_damaged_model(home: Path, name: str) -> None:
     with unchanged(home):
         outcome = command("pgdm-run", "--offline", *TINY, "run_dir=run")
         assert_helps(outcome, file.name, code=1)
+
+
+def test_an_opengl_that_mujoco_does_not_know(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "vulkan")
+    for name, arguments in (("pgdm-run", TINY), ("pgdm", ("view", "duck-lift"))):
+        assert_helps(command(name, *arguments), "vulkan", "egl", code=2)

@@ -304,7 +304,7 @@ def _locked(run_dir: Path) -> Iterator[None]:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         lock = FileLock(run_dir / ".lock")
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=0.5)  # whoever lists runs holds it for a moment
     except Timeout as error:
         raise RunError(f"another process is using '{run_dir}'; wait for it or end it") from error
     except OSError as error:

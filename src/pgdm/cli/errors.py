@@ -38,6 +38,25 @@ _CURES = {
 }
 
 
+# What MuJoCo takes on Linux; with anything else its import itself fails.
+_OPENGL = ("", "egl", "osmesa", "glfw", "glx", "enable", "enabled", "on", "true", "1")
+_NO_OPENGL = ("disable", "disabled", "off", "false", "0")
+
+
+def check_environment() -> None:
+    """Check the variables that are read before any of pgdm's own code can.
+
+    Raises:
+        ConfigError: if one has a value that nothing understands.
+    """
+    value = os.environ.get("MUJOCO_GL", "")
+    if value.lower().strip() not in (*_OPENGL, *_NO_OPENGL):
+        raise ConfigError(
+            f"the environment's MUJOCO_GL is '{value}'; valid: egl, osmesa, glfw, disable; "
+            "unset it to have pgdm choose"
+        )
+
+
 def message(error: BaseException) -> str:
     """Return what a user should read, on one line."""
     if isinstance(error, PgdmError):

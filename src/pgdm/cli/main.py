@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from pgdm.cli import assets, dashboard, runs
-from pgdm.cli.errors import USAGE, guarded, report
+from pgdm.cli.errors import USAGE, check_environment, guarded, report
 from pgdm.errors import ConfigError
 
 # click's ClickException, which typer brings as a copy of its own in newer versions.
@@ -40,6 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _main(arguments: list[str], debug: bool) -> int:
     from pgdm.cli.run import set_up_logging
 
+    check_environment()
     set_up_logging(debug)
     command = typer.main.get_command(app)
     try:

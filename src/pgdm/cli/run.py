@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pgdm.cli.errors import EXPECTED, guarded, report
+from pgdm.cli.errors import EXPECTED, check_environment, guarded, report
 from pgdm.cli.flags import Flags, read_flags
 from pgdm.errors import ConfigError
 
@@ -50,6 +50,7 @@ def _main(flags: Flags, debug: bool) -> int:
 
         print(f"pgdm {version('pgdm')}")
         return 0
+    check_environment()
     jobs = _compose(flags)
     set_up_logging(debug)
     return _run_all(_checked(jobs), debug)

@@ -30,8 +30,7 @@ def film_policy(env: BatchEnv, act: Act, path: Path) -> Path:
     Raises:
         RenderError: if no OpenGL works here or the file cannot be written.
     """
-    scene = env.sim.scene
-    with Renderer(scene.model, scene.index.object_body) as renderer:
+    with _renderer(env.sim.scene, env.mdp.reference) as renderer:
         return write_video(path, _episode(env, act, renderer))
 
 
@@ -68,7 +67,7 @@ def film_motion(scene: Scene, start: np.ndarray, reference: ObjectReference, pat
         RenderError: if no OpenGL works here or the file cannot be written.
     """
     path_qpos = motion_qpos(scene, start, reference)
-    with Renderer(scene.model, scene.index.object_body) as renderer:
+    with _renderer(scene, reference) as renderer:
         frames = (
             renderer.render_qpos(
                 path_qpos[t],
@@ -78,3 +77,7 @@ def film_motion(scene: Scene, start: np.ndarray, reference: ObjectReference, pat
             for t in range(len(reference))
         )
         return write_video(path, frames)
+
+
+def _renderer(scene: Scene, reference: ObjectReference) -> Renderer:
+    return Renderer(scene.model, scene.index.object_body, motion=reference.pos.numpy())

@@ -75,11 +75,12 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Return the current picture, (H, W, 3) uint8, the goal drawn as a ghost."""
         if self.render_mode is None:
             return None
+        reference = self._batch.mdp.reference
         if self._renderer is None:
             scene = self._batch.sim.scene
-            self._renderer = Renderer(scene.model, scene.index.object_body)
+            motion = reference.pos.numpy()
+            self._renderer = Renderer(scene.model, scene.index.object_body, motion=motion)
         t = int(self._batch.t[0])
-        reference = self._batch.mdp.reference
         return self._renderer.render(
             self.data, (reference.pos[t].numpy(), reference.quat[t].numpy())
         )

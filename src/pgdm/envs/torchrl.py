@@ -23,16 +23,19 @@ class PgdmTorchRLEnv(EnvBase):
 
     def __init__(self, batch: BatchEnv) -> None:
         n = batch.num_envs
+        one = torch.Size([n, 1])
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([n]))
         self._batch = batch
         self.observation_spec = Composite(
-            observation=Unbounded((n, batch.obs_dim), dtype=torch.float32),
-            object_error_m=Unbounded((n, 1), dtype=torch.float32),
+            observation=Unbounded(torch.Size([n, batch.obs_dim]), dtype=torch.float32),
+            object_error_m=Unbounded(one, dtype=torch.float32),
             shape=(n,),
         )
-        self.action_spec = Bounded(-1.0, 1.0, (n, batch.action_dim), dtype=torch.float32)
-        self.reward_spec = Unbounded((n, 1), dtype=torch.float32)
-        flag = Bounded(0, 1, (n, 1), dtype=torch.bool)
+        self.action_spec = Bounded(
+            -1.0, 1.0, torch.Size([n, batch.action_dim]), dtype=torch.float32
+        )
+        self.reward_spec = Unbounded(one, dtype=torch.float32)
+        flag = Bounded(0, 1, one, dtype=torch.bool)
         self.full_done_spec = Composite(
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,)
         )
