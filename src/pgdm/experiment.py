@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
-from pgdm.config.identity import check_continues
-from pgdm.config.saved import FILE, load_config, save_config
+from pgdm.config.saved import check_run_dir, save_config
 from pgdm.config.schema import ExperimentCfg
 from pgdm.envs.build import EnvBuilder, EnvCfg
 from pgdm.envs.film import film_policy
@@ -29,7 +24,7 @@ from pgdm.rl.evaluate import Evaluator
 from pgdm.rl.trainer import Extras, Outcome, Trainer, TrainerCfg
 from pgdm.tracking import RunFolder, open_tracker
 from pgdm.tracking.provenance import git_revision, versions
-from pgdm.tracking.run_folder import LINK, RESULT, read_json, write_json
+from pgdm.tracking.run_folder import RESULT, claimed, read_json, write_json
 from pgdm.tracking.run_log import RunLog, metrics_of
 from pgdm.tracking.tracker import Tracker
 
@@ -84,10 +79,10 @@ def run_experiment(
         PgdmError: if the run cannot start, go on or be saved.
     """
     run_dir = Path(cfg.run_dir)
-    _check_folder(cfg, run_dir)
+    check_run_dir(cfg)
     progress = _stoppable(stop, Spoken(notify))
     library = ensure(cfg.task.motion, cfg.offline, notify, progress=progress)
-    with _locked(run_dir):
+    with claimed(run_dir):
         builder = env_builder(cfg, library)
         return Run(cfg, builder, run_dir, notify).train(callbacks, stop)
 
@@ -140,6 +135,7 @@ class Run(Callback):
             self._notify(f"continuing {self.dir} at {state['frames']:,} frames")
         save_config(self.cfg, self.dir)
         self._log.truncate(trainer.progress.frames if state is not None else -1)
+        (self.dir / RESULT).unlink(missing_ok=True)  # it tells of an earlier end, not of this one
         self._trainer = trainer
         self._tracker = open_tracker(self.cfg.tracking, RunFolder(self.dir), self._facts)
         status = "failed"
@@ -276,40 +272,3 @@ def _stoppable(stop: Callable[[], bool], inner: FetchProgress) -> FetchProgress:
         inner(step, done, total)
 
     return progress
-
-
-def _check_folder(cfg: ExperimentCfg, run_dir: Path) -> None:
-    """Check that a run may use its folder.
-
-    Raises:
-        RunError: if it holds something else, or what ``resume`` does not allow.
-    """
-    if run_dir.exists() and not run_dir.is_dir():
-        raise RunError(f"run_dir '{run_dir}' is a file; choose a folder")
-    if (run_dir / FILE).exists():
-        if cfg.resume == "never":
-            raise RunError(f"'{run_dir}' holds a run and resume=never; choose another run_dir")
-        old = load_config(run_dir)
-        check_continues(dataclasses.replace(old, run_dir=cfg.run_dir), cfg)
-        return
-    if cfg.resume == "must":
-        raise RunError(f"'{run_dir}' holds no run and resume=must; check run_dir")
-    if run_dir.is_dir() and any(p.name not in (".lock", LINK) for p in run_dir.iterdir()):
-        raise RunError(f"'{run_dir}' is not empty and holds no run; choose another run_dir")
-
-
-@contextlib.contextmanager
-def _locked(run_dir: Path) -> Iterator[None]:
-    """Keep other processes out of a run folder."""
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(run_dir / ".lock")
-        lock.acquire(timeout=0.5)  # whoever lists runs holds it for a moment
-    except Timeout as error:
-        raise RunError(f"another process is using '{run_dir}'; wait for it or end it") from error
-    except OSError as error:
-        raise RunError(f"cannot write run_dir '{run_dir}': {error.strerror or error}") from error
-    try:
-        yield
-    finally:
-        lock.release()

@@ -9,12 +9,16 @@ from typing import Any
 
 import yaml
 
+from pgdm.config.identity import check_continues
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.strict import build
 from pgdm.errors import ConfigError, RunError
 
 FILE = "config.yaml"
 FORMAT = 1
+
+# What a run that ended before its first file was written may leave.
+_LEFT_BEHIND = (".lock", "mlflow.json")
 
 _HEADER = "# All settings of this run. pgdm-run compares them when the run goes on.\n"
 
@@ -68,6 +72,27 @@ def load_config(run_dir: str | os.PathLike[str]) -> ExperimentCfg:
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}; {cure}") from error
     return cfg
+
+
+def check_run_dir(cfg: ExperimentCfg) -> None:
+    """Check that a run may use its folder: it is new, or holds the same run.
+
+    Raises:
+        RunError: if it holds something else, or what ``resume`` does not allow.
+    """
+    run_dir = Path(cfg.run_dir)
+    if run_dir.exists() and not run_dir.is_dir():
+        raise RunError(f"run_dir '{run_dir}' is a file; choose a folder")
+    if (run_dir / FILE).exists():
+        if cfg.resume == "never":
+            raise RunError(f"'{run_dir}' holds a run and resume=never; choose another run_dir")
+        old = load_config(run_dir)
+        check_continues(dataclasses.replace(old, run_dir=cfg.run_dir), cfg)
+        return
+    if cfg.resume == "must":
+        raise RunError(f"'{run_dir}' holds no run and resume=must; check run_dir")
+    if run_dir.is_dir() and any(p.name not in _LEFT_BEHIND for p in run_dir.iterdir()):
+        raise RunError(f"'{run_dir}' is not empty and holds no run; choose another run_dir")
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -164,6 +165,27 @@ class RunFolder:
         files = plain + [(file, "videos") for file in videos]
         files += [(file, "checkpoints") for file in [checkpoints / "best.ckpt", *newest]]
         return [(file, place) for file, place in files if file.is_file()]
+
+
+@contextlib.contextmanager
+def claimed(run_dir: Path) -> Iterator[None]:
+    """Make a run folder if need be, and keep other processes out of it.
+
+    Raises:
+        RunError: if another process has it, or it cannot be written.
+    """
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(run_dir / LOCK)
+        lock.acquire(timeout=0.5)  # whoever lists runs holds it for a moment
+    except Timeout as error:
+        raise RunError(f"another process is using '{run_dir}'; wait for it or end it") from error
+    except OSError as error:
+        raise RunError(f"cannot write run_dir '{run_dir}': {error.strerror or error}") from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def find_runs(root: Path) -> list[RunFolder]:
