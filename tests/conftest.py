@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-import pgdm.library
-
 CACHE = Path(tempfile.gettempdir()) / f"pgdm-tests-{os.getuid()}"
 MISSING = CACHE / f"missing-{os.getpid()}"
 CHECKOUT: Path | None = None
@@ -22,6 +20,8 @@ if os.environ.get("PGDM_TCDM_ROOT"):
 
 def _digest(checkout: Path) -> str:
     """Return a name that changes with the checkout's files and with the code that reads them."""
+    import pgdm.library
+
     digest = hashlib.sha256()
     for path in sorted(p for p in checkout.rglob("*") if p.is_file()):
         stat = path.stat()
@@ -33,6 +33,8 @@ def _digest(checkout: Path) -> str:
 
 def _filled_home(checkout: Path) -> Path:
     """Return a ``PGDM_HOME`` whose library holds the checkout, made once per its content."""
+    import pgdm.library  # here: tests that need no library should not wait for the simulator
+
     home = CACHE / f"home-{_digest(checkout)}"
     if not home.is_dir():
         CACHE.mkdir(parents=True, exist_ok=True)
