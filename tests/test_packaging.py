@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
@@ -89,6 +90,17 @@ def test_the_pins_are_the_environment() -> None:
     }
     expected = {name: version.public for name, version in pins().items()}
     assert {n: v for n, v in installed.items() if n not in unpinned} == expected
+
+
+def test_the_pins_admit_every_python_that_pgdm_does() -> None:
+    # Debian's python3.11 is 3.11.2, and some packages begin at a later patch release.
+    oldest = PROJECT["requires-python"].removeprefix(">=")
+    exact = pins()
+    for distribution in metadata.distributions():
+        name, version = distribution.metadata["Name"], Version(distribution.version)
+        needs = distribution.metadata.get("Requires-Python")
+        if needs and exact.get(canonicalize_name(name)) == Version(version.public):
+            assert SpecifierSet(needs).contains(f"{oldest}.2"), f"{name} needs Python {needs}"
 
 
 def test_no_registry_and_no_local_path_is_named() -> None:
