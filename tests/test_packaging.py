@@ -64,9 +64,10 @@ def imported_packages() -> set[str]:
 
 def test_what_is_imported_is_declared_and_the_reverse() -> None:
     declared, used = set(requirements()), set()
+    distributions = metadata.packages_distributions()
     for name in sorted(imported_packages()):
         # Several distributions may share a top-level name, such as mlflow and mlflow-skinny.
-        owners = {canonicalize_name(d) for d in metadata.packages_distributions()[name]}
+        owners = {canonicalize_name(d) for d in distributions[name]}
         assert owners & declared, f"{name} is imported, but none of {owners} is a dependency"
         used |= owners
     assert declared <= used, f"nothing imports {declared - used}"
