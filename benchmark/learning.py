@@ -40,7 +40,12 @@ SETTINGS = {
     "ppo_fast-residual": ("algo=ppo_fast", "action=residual"),
     "ppo-absolute": ("algo=ppo", "action=absolute"),
 }
-COMMON = (f"total_frames={FRAMES}", "eval.interval_frames=100000", "budget=reduced", "seed=0")
+COMMON = (
+    f"total_frames={FRAMES}",
+    "eval.interval_frames=100000",
+    "seed=0",
+    "eval.video_every_eval=false",
+)
 CURVES = ("success", "lifted", "return", "com_error")
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -71,21 +73,16 @@ def test_settings_in_commands_exist(command: str) -> None:
     compose(words)
 
 
-def _recipe(heading: str) -> dict[str, str]:
-    """Return the files that a section of docs/extending.md has its reader write."""
+def _follow(heading: str, folder: Path) -> None:
+    """Write the files that a section of docs/extending.md has its reader write."""
     text = (DOCS / "extending.md").read_text(encoding="utf-8")
     section = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
-    steps = r"Write `(my/[^`]+\.yaml)`:\n\n    ```yaml\n(.*?)    ```"
-    names = re.findall(steps, section, re.DOTALL)
-    return {name: re.sub(r"(?m)^    ", "", body) for name, body in names}
-
-
-def _follow(heading: str, folder: Path) -> None:
-    files = _recipe(heading)
+    step = r"Write `([^`]+)`[^`]*?(?:`[^`]+`[^`]*?)*:\n\n    ```\w+\n(.*?)    ```"
+    files = re.findall(step, section, re.DOTALL)
     assert files, f"docs/extending.md writes no file under '{heading}'"
-    for name, body in files.items():
+    for name, body in files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(body, encoding="utf-8")
+        (folder / name).write_text(re.sub(r"(?m)^    ", "", body), encoding="utf-8")
 
 
 def test_recipe_for_a_suite_of_settings(tmp_path: Path) -> None:
@@ -108,3 +105,41 @@ def test_recipe_for_a_task(tmp_path: Path, library_home: Path) -> None:
     obs, reward, *_ = env.step(torch.zeros(2, env.action_dim))
     assert torch.isfinite(obs).all()
     assert torch.isfinite(reward).all()
+
+
+def test_recipe_for_a_hand(tmp_path: Path, library_home: Path) -> None:
+    from pgdm.experiment import env_builder
+    from pgdm.library import open_library
+
+    _follow("A hand", tmp_path)
+    choices = ["task=cup-pour1", "hand=adroit-tips"]
+    seen = env_builder(compose(choices, tmp_path / "my"), open_library()).make(1, 1)
+    whole = env_builder(compose(choices[:1]), open_library()).make(1, 1)
+    # Each of the ten points less is a position, a quaternion and two velocities.
+    assert whole.obs_dim - seen.obs_dim == 10 * (3 + 4 + 6)
+
+
+def test_recipe_for_a_method(tmp_path: Path, library_home: Path) -> None:
+    for part in ("src", "conf"):
+        shutil.copytree(REPOSITORY / part, tmp_path / part)
+    _follow("A method", tmp_path)
+    registry = tmp_path / "src" / "pgdm" / "methods" / "__init__.py"
+    text = registry.read_text(encoding="utf-8")
+    text = text.replace("import pgdm\n", "import near, pgdm\n", 1)
+    text = text.replace(
+        '    "pgdm": pgdm.recipe,\n', '    "pgdm": pgdm.recipe,\n    "near": near.recipe,\n'
+    )
+    registry.write_text(text, encoding="utf-8")
+    program = (
+        "import pgdm, torch\n"
+        "env = pgdm.make_batch('cup-pour1', num_envs=2, num_threads=1, method='near')\n"
+        "print(pgdm.__file__, env.step(torch.zeros(2, env.action_dim))[4]['terms']['near'].tolist())\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "src")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == f"{tmp_path / 'src' / 'pgdm' / '__init__.py'} [1.0, 1.0]\n", done.stderr

@@ -14,7 +14,7 @@ import pgdm
 from pgdm.config.groups import available
 from pgdm.envs.batch_env import BatchEnv
 from pgdm.envs.divergence import replay
-from pgdm.errors import ConfigError, PgdmError, UnknownNameError
+from pgdm.errors import ConfigError, PgdmError, RunError, UnknownNameError
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.render import Renderer
 
@@ -157,6 +157,47 @@ def test_a_diverging_simulation_ends_alone_and_is_dumped(
     assert len(dumps) == 1
     states = replay(dumps[0], SimBatch(builder.scene, 1, 1, builder.motion.substeps))
     assert len(states) == 7
+
+
+def test_a_dump_keeps_nothing_of_the_episode_before(tmp_path: Path) -> None:
+    from pgdm.config.store import compose
+    from pgdm.experiment import env_builder
+    from pgdm.library import open_library
+
+    builder = env_builder(compose(["task=dmanus-sim2real"]), open_library())
+    env = builder.make(2, 1, dump_dir=tmp_path)
+    for action in noise(env, 5):
+        env.step(action)
+    env.reset(np.array([1]))
+    env.step(noise(env, 1)[0])
+    before = env.sim.rows[1].copy()
+    env.sim.rows[1, 1:10] = 1e12
+    env.step(noise(env, 1)[0])
+    sim = SimBatch(builder.scene, 1, 1, builder.motion.substeps)
+    states = replay(next(tmp_path.glob("*-sim1.npz")), sim)
+    assert len(states) == 2
+    np.testing.assert_array_equal(states[0], before)
+
+
+def test_stepping_on_after_the_end_is_refused() -> None:
+    env = pgdm.make_batch("duck-lift", num_envs=1, num_threads=1, auto_reset=False)
+    done = False
+    while not done:
+        _, _, terminated, _, _ = env.step(env.warm_start()[None])
+        done = bool(terminated[0])
+    if int(env.t[0]) == len(env.mdp.reference) - 1:
+        with pytest.raises(RunError, match="reset it"):
+            env.step(env.warm_start()[None])
+
+
+def test_evaluation_draws_other_boxes_than_training() -> None:
+    from pgdm.config.store import compose
+    from pgdm.experiment import env_builder
+    from pgdm.library import open_library
+
+    builder = env_builder(compose(["task=dmanus-sim2real"]), open_library())
+    widths = [builder.make(3, 1, 0, stream).sim.contact()[1] for stream in ("train", "eval")]
+    assert not np.array_equal(*widths)
 
 
 def test_weights_change_by_name_only() -> None:

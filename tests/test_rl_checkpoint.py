@@ -120,6 +120,19 @@ def test_a_damaged_newest_is_passed_over_with_a_warning(
     assert "the one before" in caplog.text
 
 
+def test_a_damaged_newest_does_not_push_out_good_ones(tmp_path: Path) -> None:
+    folder = saved(tmp_path, 100, 200, keep_last=2)
+    (folder.folder / "frames_000000000200.ckpt").write_bytes(b"cut")
+    assert folder.latest() == {"frames": 100}
+    folder.save({"frames": 150}, 150)
+    folder.save({"frames": 180}, 180)
+    assert [path.name for path in folder.all()] == [
+        "frames_000000000150.ckpt",
+        "frames_000000000180.ckpt",
+    ]
+    assert folder.latest() == {"frames": 180}
+
+
 def test_none_readable_is_an_error_and_none_at_all_is_not(tmp_path: Path) -> None:
     folder = saved(tmp_path, 1)
     folder.all()[0].write_bytes(b"")

@@ -47,7 +47,8 @@ class RunResult:
     """Metrics of the last evaluation."""
     video: Path | None
     """MP4 of the last evaluated policy, deterministic."""
-    asset_source: str
+    pregrasp_used: str
+    """Where episodes started: the configured source, or its fallback."""
 
 
 def env_builder(cfg: ExperimentCfg, library: Library) -> EnvBuilder:
@@ -87,6 +88,29 @@ def run_experiment(
         return Run(cfg, builder, run_dir, notify).train(callbacks, stop)
 
 
+def check_assets(
+    metadata: dict[str, Any], builder: EnvBuilder, where: Path, notify: Notify
+) -> None:
+    """Check that a checkpoint was made with the assets that are there now.
+
+    Raises:
+        RunError: if not; names what differs.
+    """
+    for key, now in builder.facts().items():
+        if metadata.get(key) != now:
+            raise RunError(
+                f"{where} was made with {key} '{metadata.get(key)}', the library now has '{now}'; "
+                "restore the library, or start anew in another run_dir"
+            )
+    before, now = metadata.get("versions", {}), versions()
+    for package in ("mujoco", "torch"):
+        if before.get(package) != now[package]:
+            notify(
+                f"{where} was made with {package} {before.get(package)}, this is {now[package]}: "
+                "what follows is no longer equal to the bit"
+            )
+
+
 class Run(Callback):
     """One experiment in its folder; as a callback it records what the trainer does.
 
@@ -103,16 +127,9 @@ class Run(Callback):
         self.cfg, self.builder, self.dir, self._notify = cfg, builder, run_dir, notify
         self._log = RunLog(run_dir / "metrics.jsonl")
         self._checkpoints = CheckpointFolder(run_dir / "checkpoints", cfg.checkpoint.keep_last)
-        self._facts = {
-            "asset_source": builder.scene.asset_source,
-            "motion_sha256": builder.motion.sha256,
-            "pregrasp_used": builder.mdp.start.source,
-            "git": git_revision(),
-        }
+        self._facts = {**builder.facts(), "git": git_revision()}
         self._tracker: Tracker | None = None
         self._trainer: Trainer | None = None
-        self._last_frames = -1
-        self._video: Path | None = None
 
     def train(self, callbacks: Sequence[Callback], stop: Callable[[], bool]) -> RunResult:
         """Train to the end, or until ``stop``."""
@@ -122,15 +139,11 @@ class Run(Callback):
         if done and stored.get("status") == "finished":
             self._notify(f"{self.dir} is finished already; its result:")
             return self._stored_result(stored)
-        wanted, used = self.cfg.pregrasp.source, self._facts["pregrasp_used"]
-        if used != wanted:
-            self._notify(
-                f"pregrasp '{wanted}' is not stored for {self.cfg.task.id} in the "
-                f"{self._facts['asset_source']} assets; starting from '{used}'"
-            )
+        if self.builder.fallback_note:
+            self._notify(self.builder.fallback_note)
         trainer = self._make_trainer((self, *callbacks), stop)
         if state is not None:
-            self._check_assets(state["metadata"])
+            check_assets(state["metadata"], self.builder, self.dir, self._notify)
             trainer.load_state_dict(state)
             self._notify(f"continuing {self.dir} at {state['frames']:,} frames")
         save_config(self.cfg, self.dir)
@@ -143,7 +156,10 @@ class Run(Callback):
             outcome = trainer.run()
             status = outcome.status
             return self._finish(outcome)
-        except PgdmError as error:
+        except KeyboardInterrupt:
+            status = "interrupted"
+            raise
+        except (PgdmError, OSError, MemoryError) as error:
             self._write_result("failed", trainer.progress, {}, str(error))
             raise
         finally:
@@ -166,7 +182,7 @@ class Run(Callback):
         env = make(cfg.num_envs, count, cfg.seed, dump_dir=self.dir / "diverged")
         episodes = cfg.eval.episodes
         evaluator = Evaluator(
-            lambda n: make(n, min(n, count), cfg.seed),
+            lambda n: make(n, min(n, count), cfg.seed, "eval"),
             episodes,
             # Without randomness in the task all deterministic episodes are the same.
             episodes if cfg.task.randomize else 1,
@@ -184,19 +200,12 @@ class Run(Callback):
         extras = Extras(
             evaluation=evaluator,
             checkpoints=self._checkpoints,
+            schedules=self.builder.mdp.recipe.schedules,
             callbacks=callbacks,
             stop=stop,
-            metadata={k: v for k, v in self._facts.items() if k != "git"},
+            metadata={**self.builder.facts(), "versions": versions()},
         )
         return Trainer(env, trainer_cfg, extras)
-
-    def _check_assets(self, metadata: dict[str, Any]) -> None:
-        for key in ("asset_source", "motion_sha256", "pregrasp_used"):
-            if metadata.get(key) != self._facts[key]:
-                raise RunError(
-                    f"{self.dir} was started with {key} '{metadata.get(key)}', the library now has "
-                    f"'{self._facts[key]}'; choose another run_dir, or restore the library"
-                )
 
     def _record(self, progress: Progress, metrics: dict[str, float], kind: str) -> None:
         assert self._tracker is not None
@@ -211,16 +220,18 @@ class Run(Callback):
 
     def _film(self, progress: Progress) -> None:
         assert self._trainer is not None and self._tracker is not None
-        path = self.dir / "videos" / f"frames_{progress.frames:012d}.mp4"
+        path = self._video(progress)
         model = self._trainer.model
-        env = self.builder.make(1, 1, self.cfg.seed, auto_reset=False)
+        env = self.builder.make(1, 1, self.cfg.seed, "eval", auto_reset=False)
         try:
             poster = film_policy(env, lambda obs: model.act(obs, deterministic=True), path)
         except RenderError as error:
             self._notify(f"no video: {error}")
             return
-        self._video = path
         self._tracker.video(path, poster, progress.frames)
+
+    def _video(self, progress: Progress) -> Path:
+        return self.dir / "videos" / f"frames_{progress.frames:012d}.mp4"
 
     def _finish(self, outcome: Outcome) -> RunResult:
         self._write_result(outcome.status, outcome.progress, outcome.evaluation)
@@ -230,6 +241,7 @@ class Run(Callback):
         self, status: str, progress: Progress, metrics: dict[str, float], error: str = ""
     ) -> None:
         steps = progress.frames / progress.elapsed_s if progress.elapsed_s else 0.0
+        video = self._video(progress)
         write_json(
             self.dir / RESULT,
             {
@@ -241,7 +253,7 @@ class Run(Callback):
                 "wall_time_s": round(progress.elapsed_s, 1),
                 "steps_per_s": round(steps, 1),
                 "metrics": {k: v for k, v in metrics.items() if v == v},
-                "video": None if self._video is None else str(self._video.relative_to(self.dir)),
+                "video": str(video.relative_to(self.dir)) if video.exists() else None,
                 **self._facts,
                 "versions": versions(),
                 **({"error": error} if error else {}),
@@ -259,7 +271,7 @@ class Run(Callback):
             before=before,
             after=stored["metrics"],
             video=self.dir / video if video else None,
-            asset_source=stored["asset_source"],
+            pregrasp_used=stored["pregrasp_used"],
         )
 
 

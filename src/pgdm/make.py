@@ -64,7 +64,7 @@ def make_batch(
     chosen = [f"{group}={option}" for group, option in choices.items()]
     cfg = compose([f"task={task}", *chosen, *overrides])
     builder = env_builder(cfg, ensure(cfg.task.motion, offline, _log.warning))
-    return builder.make(num_envs, num_threads, seed, auto_reset)
+    return builder.make(num_envs, num_threads, seed, auto_reset=auto_reset)
 
 
 def make_torchrl(task: str, *, num_envs: int = 64, **kwargs: Any) -> PgdmTorchRLEnv:

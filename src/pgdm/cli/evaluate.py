@@ -15,7 +15,7 @@ from pgdm.config.schema import ExperimentCfg
 from pgdm.envs.build import EnvBuilder
 from pgdm.envs.film import film_policy
 from pgdm.errors import CheckpointError, RunError
-from pgdm.experiment import env_builder, threads
+from pgdm.experiment import check_assets, env_builder, threads
 from pgdm.library import ensure
 from pgdm.rl.checkpoint import CheckpointFolder, read_checkpoint
 from pgdm.rl.evaluate import Evaluator, load_policy
@@ -48,18 +48,22 @@ def evaluate_policy(request: EvalRequest) -> int:
     """
     run_dir, checkpoint = find_checkpoint(request.path, request.best)
     cfg = load_config(run_dir)
-    policy, frames = load_policy(checkpoint), int(read_checkpoint(checkpoint)["frames"])
+    policy, state = load_policy(checkpoint), read_checkpoint(checkpoint)
+    frames = int(state["frames"])
     library = ensure(cfg.task.motion, request.offline or cfg.offline, notify)
     builder = env_builder(cfg, library)
+    check_assets(state.get("metadata", {}), builder, checkpoint, notify)
+    if builder.fallback_note:
+        notify(builder.fallback_note)
     with StopRequest() as stop:
         metrics = _measure(cfg, builder, policy, request, checkpoint, stop)
     if metrics is None:
         return stop.exit_code
     kinds = ("deterministic",) if request.deterministic else ("sampled", "deterministic")
-    Console().print(metrics_table(cfg, metrics, frames, kinds))
+    Console().print(metrics_table(cfg, metrics, frames, kinds, builder.mdp.start.source))
     print(f"checkpoint: {checkpoint} ({frames:,} frames)")
     if request.video:
-        env = builder.make(1, 1, cfg.seed, auto_reset=False)
+        env = builder.make(1, 1, cfg.seed, "eval", auto_reset=False)
         path = run_dir / "videos" / f"eval_{checkpoint.stem}.mp4"
         film_policy(env, lambda obs: policy.act(obs, deterministic=True), path)
         print(f"video:      {path}")
@@ -84,7 +88,7 @@ def _measure(
             f"{probe.action_dim}: it belongs to another run"
         )
     evaluator = Evaluator(
-        lambda n: builder.make(n, min(n, count), cfg.seed),
+        lambda n: builder.make(n, min(n, count), cfg.seed, "eval"),
         # With the deterministic policy alone the sampled one is not worth its time.
         1 if request.deterministic else episodes,
         episodes if cfg.task.randomize else 1,
@@ -110,7 +114,9 @@ def find_checkpoint(path: Path, best: bool) -> tuple[Path, Path]:
     if not (path / FILE).is_file():
         raise RunError(f"'{path}' holds no run: it has no {FILE}; pgdm runs lists the runs")
     checkpoints = CheckpointFolder(path / "checkpoints", keep_last=1)
-    found = [checkpoints.best] if best and checkpoints.best.is_file() else checkpoints.all()
-    if not found:
+    if best and checkpoints.best.is_file():
+        return path, checkpoints.best
+    newest = checkpoints.newest()
+    if newest is None:
         raise CheckpointError(f"'{path}' has no checkpoint yet; start its command again")
-    return path, found[-1]
+    return path, newest[0]

@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.table import Table
 
+from pgdm.config.identity import difference
+from pgdm.config.store import PAPER_FRAMES, compose
+
 if TYPE_CHECKING:
     from pgdm.config.schema import ExperimentCfg
     from pgdm.experiment import RunResult
 
-PAPER_FRAMES = 50_000_000
-"""Environment steps behind each of the paper's figures (mean of 3 seeds, sampled actions)."""
+PAPER_START = "planned"
+_NOT_PAPER = ("seed:", "pregrasp.", "eval.episodes:")  # said apart, or no difference in kind
+_SHOWN_CHANGES = 4
 
 
 @dataclass(frozen=True)
@@ -47,17 +51,21 @@ _ROWS = (
 
 def summary_table(cfg: ExperimentCfg, result: RunResult) -> Table:
     """Return the table of a run: its first evaluation, its last, and the paper's figures."""
-    frames = result.frames
+    frames, start = result.frames, result.pregrasp_used
     columns = [
         _Column("before", result.before, "eval_sampled/"),
         _Column(f"after\n{frames:,} frames", result.after, "eval_sampled/"),
         _Column("the same,\nno noise", result.after, "eval_deterministic/"),
     ]
-    return _table(cfg, columns, _caption(cfg, frames))
+    return _table(cfg, columns, _caption(cfg, frames, start))
 
 
 def metrics_table(
-    cfg: ExperimentCfg, metrics: Mapping[str, float], frames: int, kinds: Sequence[str]
+    cfg: ExperimentCfg,
+    metrics: Mapping[str, float],
+    frames: int,
+    kinds: Sequence[str],
+    start: str,
 ) -> Table:
     """Return the table of one evaluation.
 
@@ -66,9 +74,10 @@ def metrics_table(
         metrics: as ``Evaluator`` gives them.
         frames: length of the training before it.
         kinds: ``sampled``, ``deterministic`` or both.
+        start: source of the start state that was used.
     """
     columns = [_Column(kind, metrics, f"eval_{kind}/") for kind in kinds]
-    return _table(cfg, columns, _caption(cfg, frames))
+    return _table(cfg, columns, _caption(cfg, frames, start))
 
 
 def _table(cfg: ExperimentCfg, columns: Sequence[_Column], caption: str) -> Table:
@@ -96,22 +105,19 @@ def _title(cfg: ExperimentCfg) -> str:
     return f"{cfg.task.id} ({parts}, seed {cfg.seed})"
 
 
-def _caption(cfg: ExperimentCfg, frames: int) -> str:
+def _caption(cfg: ExperimentCfg, frames: int, start: str) -> str:
     """Say how far the run may be set against the paper's figures."""
     if cfg.task.paper_success is None:
         return f"budget '{cfg.budget}'; the paper reports no figure for this task"
-    differs = [
-        text
-        for text, there in (
-            (f"{frames:,} of {PAPER_FRAMES:,} frames", frames < PAPER_FRAMES),
-            (f"action={cfg.action.kind}", cfg.action.kind != "absolute"),
-            (f"algo={cfg.algo.name}", cfg.algo.name != "ppo"),
-            (f"obs={cfg.obs.layout}", cfg.obs.layout != "released"),
-            (f"pregrasp={cfg.pregrasp.source}", cfg.pregrasp.source != "planned"),
-            (f"ablation={cfg.ablation.name}", cfg.ablation.name != "none"),
-        )
-        if there
-    ]
+    differs = [f"{frames:,} of {PAPER_FRAMES:,} frames"] if frames < PAPER_FRAMES else []
+    if start != PAPER_START:
+        differs.append(f"pregrasp={start}")
+    # All that the paper's own configuration of this task would compute in another way.
+    paper = compose([f"task={cfg.task.id}"])
+    changed = [text for text in difference(paper, cfg) if not text.startswith(_NOT_PAPER)]
+    differs += changed[:_SHOWN_CHANGES]
+    if len(changed) > _SHOWN_CHANGES:
+        differs.append(f"{len(changed) - _SHOWN_CHANGES} more settings")
     if not differs:
         return "the paper's settings; its figures are means of 3 seeds, this is one"
     return f"budget '{cfg.budget}', not comparable with the paper's figures: {', '.join(differs)}"

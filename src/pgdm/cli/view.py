@@ -6,10 +6,11 @@ from pathlib import Path
 
 from pgdm.cli.train import notify
 from pgdm.config.store import compose
-from pgdm.envs.film import film_motion, motion_qpos
+from pgdm.envs.film import film_motion
 from pgdm.errors import ConfigError
 from pgdm.experiment import env_builder
 from pgdm.library import ensure
+from pgdm.sim.replay import motion_qpos
 
 
 def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> None:
@@ -23,13 +24,13 @@ def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> No
     cfg = compose([f"task={task}", f"pregrasp={pregrasp}"])
     builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
     start, reference = builder.mdp.start, builder.mdp.reference
-    if start.source != pregrasp:
-        notify(f"pregrasp '{pregrasp}' is not stored for {task}; showing '{start.source}'")
+    if builder.fallback_note:
+        notify(builder.fallback_note)
     if video is None:
         from pgdm.sim.viewer import show_motion
 
         show_motion(builder.scene.model, motion_qpos(builder.scene, start.qpos, reference))
         return
-    poster = film_motion(builder.scene, start.qpos, reference, video)
+    poster = film_motion(builder.make(1, 1), video)
     print(f"video:  {video}")
     print(f"poster: {poster}")

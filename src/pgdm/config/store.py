@@ -40,6 +40,9 @@ __all__ = [
 COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, ValueError)
 """What Hydra and its YAML reader raise at wrong settings; ``explain`` makes a ConfigError of it."""
 
+PAPER_FRAMES = 50_000_000
+"""Environment steps behind each of the paper's figures."""
+
 # Hydra keeps the current application in process-wide state, which two threads must not swap.
 _LOCK = threading.RLock()
 
@@ -61,10 +64,18 @@ def from_dict_config(composed: DictConfig) -> ExperimentCfg:
     assert isinstance(plain, dict)
     data = {str(key): value for key, value in plain.items()}
     chosen = data.get("run_dir")
-    cfg = build(ExperimentCfg, data | {"run_dir": "." if chosen is None else chosen})
+    given = {"run_dir": "." if chosen is None else chosen}
+    if data.get("budget") is None:
+        given["budget"] = _budget(data.get("total_frames"))
+    cfg = build(ExperimentCfg, data | given)
     cfg.validate()
     check_device(cfg.device)
     return cfg if chosen is not None else dataclasses.replace(cfg, run_dir=default_run_dir(cfg))
+
+
+def _budget(total_frames: object) -> str:
+    whole = isinstance(total_frames, int) and total_frames >= PAPER_FRAMES
+    return "paper" if whole else "reduced"
 
 
 def compose(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pgdm.envs.divergence import History
-from pgdm.errors import UnknownNameError
+from pgdm.errors import RunError, UnknownNameError
 from pgdm.mdp.actions import ActionMap
 from pgdm.mdp.context import StepContext
 from pgdm.mdp.metrics import Episodes, episode_metrics
@@ -68,7 +68,8 @@ class BatchEnv:
         n, horizon = self.num_envs, len(mdp.reference)
         self._t = torch.zeros(n, dtype=torch.int64)
         self._return = torch.zeros(n, dtype=torch.float64)
-        self._term_sums = {name: torch.zeros(n, dtype=torch.float64) for name in self._weights}
+        sums = [f"{kind}/{name}" for kind in ("term", "raw") for name in self._weights]
+        self._term_sums = {name: torch.zeros(n, dtype=torch.float64) for name in sums}
         self._pos = torch.zeros(n, horizon, 3, dtype=torch.float64)
         self._quat = torch.zeros(n, horizon, 4, dtype=torch.float64)
         self._all = np.arange(n)
@@ -103,7 +104,7 @@ class BatchEnv:
         return self._obs
 
     def step(self, action: Tensor) -> StepResult:
-        """Take one control step (0.04 s) with actions (N, A) in [-1, 1], clipped to it.
+        """Take one control step with actions (N, A) in [-1, 1], clipped to it.
 
         Returns:
             obs (N, D) float32, of restarted rows those after the restart; reward (N,) float32;
@@ -113,6 +114,8 @@ class BatchEnv:
             rewards, ``raw_terms`` before weighting, ``ends`` {name: (N,) bool} and ``episodes``
             {metric: (k,)} of the k episodes that finished.
         """
+        if not self._auto_reset and bool((self._t >= len(self.mdp.reference) - 1).any()):
+            raise RunError("the motion is over in at least one simulation; reset it before step()")
         ctrl = self.mdp.actions.act(action, self._t).numpy()
         self._history.record(ctrl)
         diverged = torch.from_numpy(self.sim.step(ctrl))
@@ -127,12 +130,14 @@ class BatchEnv:
         error = object_error(context)
         if diverged.any():
             terms = {name: value.masked_fill(diverged, 0.0) for name, value in terms.items()}
+            raw = {name: value.masked_fill(diverged, 0.0) for name, value in raw.items()}
         reward = torch.stack(tuple(terms.values())).sum(0)
         final = self.mdp.observe(state, self._t)
         if diverged.any():
             final[diverged] = self._obs[diverged]
-            self._history.dump(diverged.nonzero()[:, 0].tolist())
-        self._account(state, reward, terms, diverged)
+            rows = diverged.nonzero()[:, 0]
+            self._history.dump(rows.tolist(), self._t[rows].tolist())
+        self._account(state, reward, terms, raw, diverged)
         info: dict[str, Any] = {
             "final_obs": final,
             "qpos": state.qpos,
@@ -212,11 +217,17 @@ class BatchEnv:
         )
 
     def _account(
-        self, state: SimState, reward: Tensor, terms: dict[str, Tensor], diverged: Tensor
+        self,
+        state: SimState,
+        reward: Tensor,
+        terms: dict[str, Tensor],
+        raw: dict[str, Tensor],
+        diverged: Tensor,
     ) -> None:
         self._return += reward
         for name, value in terms.items():
-            self._term_sums[name] += value
+            self._term_sums[f"term/{name}"] += value
+            self._term_sums[f"raw/{name}"] += raw[name]
         keep = diverged[:, None]  # a diverged simulation keeps its last sane pose
         last = self._t - 1
         self._pos[self._rows, self._t] = torch.where(
@@ -234,5 +245,5 @@ class BatchEnv:
         metrics["return"] = self._return[done].clone()
         metrics["diverged"] = diverged[done].double()
         metrics |= {f"end/{name}": flag[done].double() for name, flag in ends.items()}
-        metrics |= {f"term/{name}": total[done] for name, total in self._term_sums.items()}
+        metrics |= {name: total[done] for name, total in self._term_sums.items()}
         return metrics

@@ -44,6 +44,7 @@ class EnvBuilder:
     def __init__(self, library: Library, cfg: EnvCfg, recipe: Recipe) -> None:
         self.scene: Scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
         self.motion = library.motion(cfg.task.motion)
+        self._wanted = cfg.pregrasp.source
         start = start_state(cfg.pregrasp, self.motion, self.scene)
         index = self.scene.index
         reference = _reference(cfg.reference, ObjectReference.of(self.motion), self.scene)
@@ -55,17 +56,41 @@ class EnvBuilder:
             recipe=recipe,
         )
 
+    @property
+    def fallback_note(self) -> str:
+        """A sentence that says so if episodes start elsewhere than was asked for, or nothing."""
+        used = self.mdp.start.source
+        if used == self._wanted:
+            return ""
+        return (
+            f"pregrasp '{self._wanted}' is not stored for {self.scene.task.id} in the "
+            f"{self.scene.asset_source} assets; starting from '{used}'"
+        )
+
+    def facts(self) -> dict[str, str]:
+        """Return what a result depends on besides its configuration and the program."""
+        return {
+            "asset_source": self.scene.asset_source,
+            "motion_sha256": self.motion.sha256,
+            "scene_sha256": self.scene.digest(),
+            "pregrasp_used": self.mdp.start.source,
+        }
+
     def make(
         self,
         num_envs: int,
         num_threads: int = 0,
         seed: int = 0,
+        stream: str = "train",
         auto_reset: bool = True,
         dump_dir: Path | None = None,
     ) -> BatchEnv:
-        """Return N simulations of the task; see `BatchEnv` for the arguments."""
+        """Return N simulations of the task; see `BatchEnv` for the arguments.
+
+        ``stream`` names what the simulations are for: each has random numbers of its own.
+        """
         sim = SimBatch(self.scene, num_envs, num_threads, self.motion.substeps)
-        randomize = Randomizer(seed, num_envs) if self.scene.task.randomize else None
+        randomize = Randomizer(seed, stream, num_envs) if self.scene.task.randomize else None
         return BatchEnv(sim, self.mdp, randomize, auto_reset, dump_dir)
 
 

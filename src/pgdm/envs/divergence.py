@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +31,6 @@ class History:
         self._states = np.zeros((KEPT_STEPS, n, sim.rows.shape[1]))
         self._ctrl = np.zeros((KEPT_STEPS, n, nu))
         self._count = 0
-        self._dumped = 0
 
     def record(self, ctrl: np.ndarray) -> None:
         """Keep the states as they are, and the targets (N, nu) about to be applied to them."""
@@ -40,36 +41,46 @@ class History:
         self._ctrl[slot] = ctrl
         self._count += 1
 
-    def dump(self, sims: list[int]) -> None:
-        """Write the ring's rows of simulations ``sims``, oldest first, to one file each."""
+    def dump(self, sims: list[int], steps: list[int]) -> None:
+        """Write the last states and targets of simulations, oldest first, to one file each.
+
+        Args:
+            sims: which simulations.
+            steps: their control steps since reset, so that nothing of an earlier episode is kept.
+        """
         _log.warning("%d simulation(s) diverged in '%s'", len(sims), self._sim.scene.task.id)
         if self._folder is None:
             return
-        order = [i % KEPT_STEPS for i in range(max(0, self._count - KEPT_STEPS), self._count)]
-        for sim in sims[: MAX_DUMPS - self._dumped]:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            path = self._folder / f"{self._dumped:02d}-step{self._count}-sim{sim}.npz"
-            np.savez(
-                path,
-                states=self._states[order, sim],
-                ctrl=self._ctrl[order, sim],
-                task=np.array(self._sim.scene.task.id),
-            )
-            self._dumped += 1
+        self._folder.mkdir(parents=True, exist_ok=True)
+        room = MAX_DUMPS - len(list(self._folder.glob("*.npz")))
+        for sim, count in list(zip(sims, steps, strict=True))[: max(room, 0)]:
+            kept = range(self._count - min(count, KEPT_STEPS, self._count), self._count)
+            order = [k % KEPT_STEPS for k in kept]
+            content: dict[str, Any] = {
+                "states": self._states[order, sim],
+                "ctrl": self._ctrl[order, sim],
+            }
+            if self._sim.scene.index.randomized_geom is not None:
+                friction, half_width = self._sim.contact()
+                content |= {"friction": friction[sim], "half_width": half_width[sim]}
+            path = self._folder / f"{time.time_ns()}-sim{sim}.npz"
+            np.savez(path, task=np.array(self._sim.scene.task.id), **content)
             _log.warning("its last %d states and targets: %s", len(order), path)
 
 
 def replay(path: Path, sim: SimBatch) -> np.ndarray:
-    """Step a dump again in ``sim`` (one simulation of the same scene).
+    """Step a dump again in ``sim``, one simulation of the same scene.
 
     Returns:
         The states after each step, (K, nstate); the last one is where it diverged.
     """
     with np.load(path) as dump:
-        states, ctrl = dump["states"], dump["ctrl"]
-    sim.restore(states[:1])
+        stored = dict(dump)
+    if "friction" in stored:
+        sim.set_contact(np.array([0]), stored["friction"][None], stored["half_width"][None])
+    sim.restore(stored["states"][:1])
     after = []
-    for target in ctrl:
+    for target in stored["ctrl"]:
         sim.step(target[None])
         after.append(sim.rows[0].copy())
     return np.array(after)

@@ -31,7 +31,7 @@ def film_policy(env: BatchEnv, act: Act, path: Path) -> Path:
         RenderError: if no OpenGL works here or the file cannot be written.
     """
     with _renderer(env.sim.scene, env.mdp.reference) as renderer:
-        return write_video(path, _episode(env, act, renderer))
+        return write_video(path, _episode(env, act, renderer), round(1 / env.sim.control_dt_s))
 
 
 def _episode(env: BatchEnv, act: Act, renderer: Renderer) -> Iterator[np.ndarray]:
@@ -51,32 +51,31 @@ def _episode(env: BatchEnv, act: Act, renderer: Renderer) -> Iterator[np.ndarray
         yield frame
 
 
-def film_motion(scene: Scene, start: np.ndarray, reference: ObjectReference, path: Path) -> Path:
+def film_motion(env: BatchEnv, path: Path) -> Path:
     """Write an MP4 of the exemplar motion with the hand at its pre-grasp; return its poster.
 
     Kinematic: nothing is simulated. Where the followed body has six joints of its own the object
     itself moves, else only its ghost.
 
     Args:
-        scene: the task's scene.
-        start: qpos (nq,) of the pre-grasp.
-        reference: the motion.
+        env: the task, in any state.
         path: of the MP4.
 
     Raises:
         RenderError: if no OpenGL works here or the file cannot be written.
     """
-    path_qpos = motion_qpos(scene, start, reference)
+    scene, reference = env.sim.scene, env.mdp.reference
+    qpos = motion_qpos(scene, env.mdp.start.qpos, reference)
     with _renderer(scene, reference) as renderer:
         frames = (
             renderer.render_qpos(
-                path_qpos[t],
+                qpos[t],
                 (reference.pos[t].numpy(), reference.quat[t].numpy()),
                 f"{scene.task.id}  exemplar motion  {t}/{len(reference) - 1}",
             )
             for t in range(len(reference))
         )
-        return write_video(path, frames)
+        return write_video(path, frames, round(1 / env.sim.control_dt_s))
 
 
 def _renderer(scene: Scene, reference: ObjectReference) -> Renderer:

@@ -13,8 +13,6 @@ from pgdm.envs.batch_env import BatchEnv
 from pgdm.sim.batch import Data, Model
 from pgdm.sim.render import Renderer
 
-CONTROL_HZ = 25
-
 
 class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One task as a Gymnasium environment.
@@ -29,10 +27,12 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: ``rgb_array`` or None.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012 (Gymnasium's own form)
+    # The speed of most tasks; hammer-strike's own is set below.
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 (Gymnasium's form)
 
     def __init__(self, batch: BatchEnv, render_mode: str | None = None) -> None:
         self._batch = batch
+        self.metadata = {**self.metadata, "render_fps": round(1 / batch.sim.control_dt_s)}
         self.render_mode = render_mode
         self.observation_space = spaces.Box(-np.inf, np.inf, (batch.obs_dim,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (batch.action_dim,), np.float32)
@@ -59,7 +59,7 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return obs[0].numpy().copy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Take one control step (0.04 s)."""
+        """Take one control step."""
         tensor = torch.as_tensor(np.asarray(action, np.float32))[None]
         obs, reward, terminated, truncated, info = self._batch.step(tensor)
         out: dict[str, Any] = {

@@ -35,6 +35,8 @@ class Recipe:
     rewards: tuple[RewardTerm, ...]
     ends: tuple[EndTerm, ...]
     metrics: MetricsCfg
+    schedules: tuple[Callable[[int], dict[str, float]], ...] = ()
+    """From environment steps so far to reward weights by term name, asked before each iteration."""
 
     def table(self) -> list[tuple[str, str, str]]:
         """Return what is active as rows (kind, name, weight), for people to read."""

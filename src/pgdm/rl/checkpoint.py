@@ -77,19 +77,30 @@ class CheckpointFolder:
         return self.best
 
     def latest(self) -> State | None:
-        """Return the newest state that can be read, or None if there is no checkpoint.
+        """Return the newest state that can be read, or None if there is no checkpoint."""
+        found = self.newest()
+        return None if found is None else found[1]
 
-        A damaged file is passed over for the one before it, with a warning.
+    def newest(self) -> tuple[Path, State] | None:
+        """Return the newest checkpoint that can be read and its state, or None if there is none.
+
+        A damaged file is passed over for the one before it, with a warning, and renamed so that
+        it does not count among the last ones when others are dropped.
 
         Raises:
             CheckpointError: if there are checkpoints but none can be read.
         """
-        paths = self.all()
+        paths, damaged = self.all(), []
         for path in reversed(paths):
             try:
-                return read_checkpoint(path)
+                state = read_checkpoint(path)
             except CheckpointError as error:
                 _log.warning("%s; going on from the one before", error)
+                damaged.append(path)
+                continue
+            for bad in damaged:
+                _set_aside(bad)
+            return path, state
         if paths:
             raise CheckpointError(
                 f"none of the {len(paths)} checkpoints in {self.folder} can be read; start anew "
@@ -175,6 +186,13 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _set_aside(path: Path) -> None:
+    try:
+        path.rename(path.with_suffix(".damaged"))
+    except OSError as error:
+        _log.warning("cannot rename %s: %s", path, error.strerror)
 
 
 def _remove(path: Path) -> None:

@@ -187,6 +187,8 @@ class Trainer:
             if self.extras.checkpoints is not None:
                 path = self.extras.checkpoints.save_best(self.state_dict())
                 self._tell(lambda callback: callback.on_checkpoint(self.progress, path))
+        if self._frames >= self.cfg.total_frames:
+            self._save()  # before anybody who listens can fail
         self._tell(lambda callback: callback.on_evaluation(self.progress, metrics))
 
     def _save(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import mujoco
@@ -42,7 +43,8 @@ class SimBatch:
     Args:
         scene: what to simulate.
         num_envs: N.
-        num_threads: threads that step them; 0 takes one per core. Results do not depend on it.
+        num_threads: threads that step them; 0 takes one per core that
+            this process may use. Results do not depend on it.
         substeps: physics steps per control step.
     """
 
@@ -50,7 +52,8 @@ class SimBatch:
         self.scene = scene
         self.num_envs = num_envs
         self._substeps = substeps
-        self._batch = mujoco_batch.Batch(scene.model, num_envs, num_threads, persistent=True)
+        threads = num_threads or len(os.sched_getaffinity(0))
+        self._batch = mujoco_batch.Batch(scene.model, num_envs, threads, persistent=True)
         fields = ("qpos", "qvel", "ctrl", "qfrc_applied", "qfrc_bias", "warning")
         self._f = {name: getattr(self._batch, name) for name in fields}
         derived = ("geom_xpos", "xquat", "xipos", "cvel", "subtree_com")
@@ -63,6 +66,11 @@ class SimBatch:
         if index.randomized_geom is not None:
             self._batch.expand("geom_friction")
             self._batch.expand("geom_size")
+
+    @property
+    def control_dt_s(self) -> float:
+        """Time of one control step, s; 0.04 in all tasks but hammer-strike."""
+        return self.scene.model.opt.timestep * self._substeps
 
     @property
     def rows(self) -> np.ndarray:

@@ -20,11 +20,13 @@ class Randomizer:
 
     Args:
         seed: of the stream it draws from.
+        stream: name of that stream, so that training and evaluation draw apart.
         num_envs: N.
     """
 
-    def __init__(self, seed: int, num_envs: int) -> None:
-        self._rng = numpy_stream(seed, "randomize")
+    def __init__(self, seed: int, stream: str, num_envs: int) -> None:
+        self._stream = f"randomize-{stream}"
+        self._rng = numpy_stream(seed, self._stream)
         self._friction = np.zeros((num_envs, 3))
         self._half_width = np.zeros(num_envs)
 
@@ -36,7 +38,7 @@ class Randomizer:
 
     def reseed(self, seed: int) -> None:
         """Start the stream of another seed."""
-        self._rng = numpy_stream(seed, "randomize")
+        self._rng = numpy_stream(seed, self._stream)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the drawn values and the stream's state."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,18 @@ from pgdm.library import Library
 
 # SPEC 5, R: the randomised contact geom outranks what it touches, so that its friction counts.
 RANDOMIZED_PRIORITY = 10
+
+
+# Fields of a model that say how its bodies, joints, contacts and actuators behave.
+_PHYSICS = (
+    *("body_pos", "body_quat", "body_mass", "body_inertia", "body_ipos", "body_iquat"),
+    *("jnt_pos", "jnt_axis", "jnt_range", "jnt_margin", "jnt_solref", "jnt_solimp"),
+    *("dof_damping", "dof_armature", "dof_frictionloss", "tendon_range", "wrap_prm"),
+    *("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_friction", "geom_condim"),
+    *("geom_contype", "geom_conaffinity", "geom_margin", "geom_solref", "geom_solimp"),
+    *("mesh_vert", "pair_geom1", "pair_geom2", "pair_dim", "pair_friction"),
+    *("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange"),
+)
 
 
 @dataclass(frozen=True)
@@ -113,6 +126,16 @@ class Scene:
     hand: HandCfg
     asset_source: str
     """The library's source that serves the task's assets."""
+
+    def digest(self) -> str:
+        """Return a SHA-256 over all that the physics depends on: equal scenes move equally."""
+        digest = hashlib.sha256()
+        for name in _PHYSICS:
+            digest.update(np.ascontiguousarray(getattr(self.model, name)).tobytes())
+        option = self.model.opt
+        numbers = (option.timestep, option.iterations, option.noslip_iterations, option.cone)
+        digest.update(repr(numbers).encode())
+        return digest.hexdigest()
 
 
 def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> Scene:
