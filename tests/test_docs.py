@@ -133,7 +133,8 @@ def test_recipe_for_a_method(tmp_path: Path, library_home: Path) -> None:
     program = (
         "import pgdm, torch\n"
         "env = pgdm.make_batch('cup-pour1', num_envs=2, num_threads=1, method='near')\n"
-        "print(pgdm.__file__, env.step(torch.zeros(2, env.action_dim))[4]['terms']['near'].tolist())\n"
+        "info = env.step(torch.zeros(2, env.action_dim))[4]\n"
+        "print(pgdm.__file__, info['terms']['near'].tolist())\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", program],
