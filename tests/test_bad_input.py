@@ -419,7 +419,7 @@ def test_a_checkpoint_of_another_task(home: Path, tmp_path: Path) -> None:
     shutil.copytree(tmp_path / "other" / "checkpoints", tmp_path / "run" / "checkpoints")
     with unchanged(tmp_path / "run" / "checkpoints", tmp_path / "run" / "config.yaml"):
         evaluated = command("pgdm", "eval", "run", "--offline")
-        assert_helps(evaluated, "belongs to another run", code=1)
+        assert_helps(evaluated, "was made with", "another run_dir", code=1)
         resumed = command("pgdm-run", "--offline", *TINY, "run_dir=run")
         assert_helps(resumed, "run", code=1)
 

@@ -179,7 +179,7 @@ def test_durations(seconds: float, text: str) -> None:
 def table_of(overrides: list[str], frames: int) -> str:
     before = {"eval_sampled/success": 0.01}
     after = {"eval_sampled/success": 0.5, "eval_deterministic/com_error_released": 2e-3}
-    result = RunResult("finished", Path(), frames, before, after, None, "checkout")
+    result = RunResult("finished", Path(), frames, before, after, None, "planned")
     console = Console(file=io.StringIO(), width=120)
     console.print(summary_table(compose(overrides), result))
     return console.file.getvalue()  # type: ignore[attr-defined]

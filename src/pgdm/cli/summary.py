@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pgdm.experiment import RunResult
 
 PAPER_START = "planned"
-_NOT_PAPER = ("seed:", "pregrasp.", "eval.episodes:")  # said apart, or no difference in kind
+_NOT_PAPER = ("seed", "pregrasp", "eval.episodes")  # said apart, or no difference in kind
 _SHOWN_CHANGES = 4
 
 
@@ -112,12 +112,37 @@ def _caption(cfg: ExperimentCfg, frames: int, start: str) -> str:
     differs = [f"{frames:,} of {PAPER_FRAMES:,} frames"] if frames < PAPER_FRAMES else []
     if start != PAPER_START:
         differs.append(f"pregrasp={start}")
-    # All that the paper's own configuration of this task would compute in another way.
-    paper = compose([f"task={cfg.task.id}"])
-    changed = [text for text in difference(paper, cfg) if not text.startswith(_NOT_PAPER)]
+    changed = _changes(cfg)
     differs += changed[:_SHOWN_CHANGES]
     if len(changed) > _SHOWN_CHANGES:
         differs.append(f"{len(changed) - _SHOWN_CHANGES} more settings")
     if not differs:
         return "the paper's settings; its figures are means of 3 seeds, this is one"
     return f"budget '{cfg.budget}', not comparable with the paper's figures: {', '.join(differs)}"
+
+
+def _changes(cfg: ExperimentCfg) -> list[str]:
+    """Return what the paper's own configuration of this task would compute in another way."""
+    paper = compose([f"task={cfg.task.id}"])
+    mine, papers = _options(cfg), _options(paper)
+    found: dict[str, None] = {}
+    for text in difference(paper, cfg):
+        key, _, values = text.partition(": ")
+        if key.startswith(_NOT_PAPER):
+            continue
+        group = key.partition(".")[0]
+        whole = mine.get(group) != papers.get(group)
+        found[f"{group}={mine[group]}" if whole else f"{key}={values.rpartition(' -> ')[2]}"] = None
+    return list(found)
+
+
+def _options(cfg: ExperimentCfg) -> dict[str, str]:
+    return {
+        "action": cfg.action.kind,
+        "algo": cfg.algo.name,
+        "obs": cfg.obs.layout,
+        "reference": cfg.reference.frame,
+        "method": cfg.method.name,
+        "ablation": cfg.ablation.name,
+        "hand": cfg.hand.name,
+    }

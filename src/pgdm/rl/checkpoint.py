@@ -90,21 +90,22 @@ class CheckpointFolder:
         Raises:
             CheckpointError: if there are checkpoints but none can be read.
         """
-        paths, damaged = self.all(), []
+        paths, damaged, reason = self.all(), [], ""
         for path in reversed(paths):
             try:
                 state = read_checkpoint(path)
             except CheckpointError as error:
                 _log.warning("%s; going on from the one before", error)
                 damaged.append(path)
+                reason = str(error)
                 continue
             for bad in damaged:
                 _set_aside(bad)
             return path, state
         if paths:
             raise CheckpointError(
-                f"none of the {len(paths)} checkpoints in {self.folder} can be read; start anew "
-                "in another run_dir"
+                f"none of the {len(paths)} checkpoints in {self.folder} can be read ({reason}); "
+                "start anew in another run_dir"
             )
         return None
 
