@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -153,6 +154,14 @@ def test_every_room_has_a_floor() -> None:
     known = set().union(*FLOORS)
     unknown = {room(module) for module in read_sources()} - known
     assert not unknown, f"give these rooms a floor here and in docs/architecture.md: {unknown}"
+
+
+def test_the_documentation_draws_the_same_floors() -> None:
+    page = (REPOSITORY / "docs" / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| ([^|]+) \|", page, re.MULTILINE)
+    drawn = {name: int(row) for row, names in rows for name in re.findall(r"`(\w+)`", names)}
+    rooms = {room(module) for module in read_sources()}
+    assert drawn == {name: floor(name) + 1 for name in rooms}
 
 
 def test_imports_go_down_only() -> None:
