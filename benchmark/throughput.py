@@ -139,6 +139,8 @@ def peak_memory_mib(task: str) -> float:
 
 def measure(task: str, rounds: int, console: Console) -> dict[str, list[float]]:
     """Return each figure's value in every round."""
+    # torch's helper threads spin after each parallel call, on a core that the physics needs.
+    torch.set_num_threads(1)
     builder = env_builder(compose([f"task={task}"]), open_library())
     actions = actions_of(builder, 64)
     figures: dict[str, list[float]] = {}
