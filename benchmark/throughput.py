@@ -2,9 +2,9 @@
 
     python benchmark/throughput.py [--task hammer-use1] [--rounds 5] [--write]
 
-Every round steps the same actions three times: the batch env, and bare ``mujoco.batch.Batch``
-doing the very same physics (targets, gravity compensation, restarts) with nothing around it, so
-that the machine's drift hits all alike; ratios are medians over the rounds.
+Beside everything runs bare ``mujoco.batch.Batch`` doing the very same physics (targets, gravity
+compensation, restarts) with nothing around it: step by step beside the batch env, and after each
+iteration of a training, so that the machine's drift hits both alike.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
@@ -39,8 +40,9 @@ from pgdm.rl.trainer import Extras, Trainer, TrainerCfg
 from pgdm.tracking.provenance import versions
 
 RESULT = Path(__file__).parent / "results" / "throughput.json"
-STEPS = 100  # control steps of all simulations in one measurement
-ITERATIONS = 5  # of training in one measurement
+STEPS = 64  # control steps of all simulations in one measurement
+CURRENT = mujoco.mjtStage.mjSTAGE_VEL
+ITERATIONS = 3  # of training in one measurement
 
 FIRST_STEP = """
 import time; start = time.perf_counter()
@@ -60,65 +62,104 @@ def actions_of(builder: EnvBuilder, num_envs: int) -> list[torch.Tensor]:
     return [warm + 0.2 * torch.randn(shape, generator=generator) for _ in range(STEPS)]
 
 
-def step_env(builder: EnvBuilder, actions: list[torch.Tensor]) -> tuple[float, list[np.ndarray]]:
-    """Return steps/s of the batch env, and which rows restarted after each step."""
-    env = builder.make(len(actions[0]), 0)
-    restarts = []
-    start = time.perf_counter()
-    for action in actions:
-        _, _, terminated, truncated, _ = env.step(action)
-        restarts.append((terminated | truncated).nonzero()[:, 0].numpy())
-    rate = len(actions) * env.num_envs / (time.perf_counter() - start)
-    return rate, restarts
+class Bare:
+    """The physics of the batch env without pgdm: targets, gravity compensation, restarts."""
 
+    def __init__(self, builder: EnvBuilder, num_envs: int) -> None:
+        self._batch = mujoco_batch.Batch(builder.scene.model, num_envs, 0, persistent=True)
+        self._start, self._substeps = builder.mdp.start, builder.motion.substeps
+        self._n = builder.scene.index.num_compensated
+        self._ctrl, self._applied = self._batch.ctrl, self._batch.qfrc_applied
+        self._bias = self._batch.bind("qfrc_bias")
+        self._qpos, self._qvel = self._batch.qpos, self._batch.qvel
+        self._restart(np.arange(num_envs))
 
-def step_bare(
-    builder: EnvBuilder, actions: list[torch.Tensor], restarts: list[np.ndarray]
-) -> float:
-    """Return steps/s of the same physics without pgdm."""
-    num_envs, start_state = len(actions[0]), builder.mdp.start
-    batch = mujoco_batch.Batch(builder.scene.model, num_envs, 0, persistent=True)
-    ctrl, applied, bias = batch.ctrl, batch.qfrc_applied, batch.bind("qfrc_bias")
-    qpos, qvel = batch.qpos, batch.qvel
-    stage, n = mujoco.mjtStage.mjSTAGE_VEL, builder.scene.index.num_compensated
-    t = torch.zeros(num_envs, dtype=torch.int64)
-    targets = [builder.mdp.actions.act(action, t).numpy() for action in actions]
+    def _restart(self, ids: np.ndarray) -> None:
+        self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._qpos[ids], self._qvel[ids] = self._start.qpos, self._start.qvel
+        self._batch.forward(ids, stage=CURRENT)
 
-    def restart(ids: np.ndarray) -> None:
-        batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        qpos[ids], qvel[ids] = start_state.qpos, start_state.qvel
-        batch.forward(ids, stage=stage)
-
-    restart(np.arange(num_envs))
-    start = time.perf_counter()
-    for target, finished in zip(targets, restarts, strict=True):
-        ctrl[:] = target
-        applied[:, :n] = bias[:, :n]
-        batch.step(nstep=builder.motion.substeps, stage=stage)
+    def step(self, target: np.ndarray, finished: np.ndarray) -> None:
+        """Take one control step, then restart the rows that the env restarted."""
+        self._ctrl[:] = target
+        self._applied[:, : self._n] = self._bias[:, : self._n]
+        self._batch.step(nstep=self._substeps, stage=CURRENT)
         if len(finished):
-            restart(finished)
-    return len(actions) * num_envs / (time.perf_counter() - start)
+            self._restart(finished)
+
+
+@dataclass
+class Script:
+    """What was done in one measurement, to be done again."""
+
+    targets: list[np.ndarray]
+    finished: list[np.ndarray]
+
+    def play(self, bare: Bare) -> float:
+        """Do it again; return s."""
+        start = time.perf_counter()
+        for target, finished in zip(self.targets, self.finished, strict=True):
+            bare.step(target, finished)
+        return time.perf_counter() - start
+
+
+def step_side_by_side(
+    builder: EnvBuilder, actions: list[torch.Tensor]
+) -> tuple[float, float, Script]:
+    """Step env and bare physics in turn, one control step each; return s of both, and what."""
+    num_envs = len(actions[0])
+    env, bare = builder.make(num_envs), Bare(builder, num_envs)
+    t = torch.zeros(num_envs, dtype=torch.int64)
+    script, in_env, in_bare = Script([], []), 0.0, 0.0
+    for action in actions:
+        target = builder.mdp.actions.act(action, t).numpy()
+        start = time.perf_counter()
+        _, _, terminated, truncated, _ = env.step(action)
+        middle = time.perf_counter()
+        finished = (terminated | truncated).nonzero()[:, 0].numpy()
+        between = time.perf_counter()
+        bare.step(target, finished)
+        in_env += middle - start
+        in_bare += time.perf_counter() - between
+        script.targets.append(target)
+        script.finished.append(finished)
+    return in_env, in_bare, script
 
 
 class Clock(Callback):
-    """Notes when each iteration ends."""
+    """Takes the time of each iteration, and plays the bare physics after each."""
 
-    def __init__(self) -> None:
-        self.ends: list[float] = []
+    def __init__(self, builder: EnvBuilder, script: Script) -> None:
+        self._builder, self._script = builder, script
+        self.training_s: list[float] = []
+        self.bare_s: list[float] = []
+        self._since = 0.0
+
+    def on_start(self, trainer: Trainer) -> None:
+        """Begin."""
+        self._since = time.perf_counter()
 
     def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
-        """Note the time."""
-        self.ends.append(time.perf_counter())
+        """Note the iteration's time, and that of the bare physics."""
+        self.training_s.append(time.perf_counter() - self._since)
+        bare = Bare(self._builder, len(self._script.targets[0]))
+        self.bare_s.append(self._script.play(bare))
+        self._since = time.perf_counter()
 
 
-def train(builder: EnvBuilder, cfg: ExperimentCfg) -> float:
-    """Return environment steps/s of collecting and learning, evaluation and saving aside."""
+def train(builder: EnvBuilder, cfg: ExperimentCfg, script: Script) -> tuple[float, float]:
+    """Return steps/s of collecting and learning, and of the bare physics in between.
+
+    Evaluation and saving are left out; the first iteration warms up.
+    """
     threads = len(os.sched_getaffinity(0))
     frames = cfg.num_envs * cfg.algo.steps_per_env
-    clock = Clock()
+    clock = Clock(builder, script)
     trainer_cfg = TrainerCfg(cfg.algo, 0, frames * (ITERATIONS + 1), 0, 1e9, "cpu", threads)
     Trainer(builder.make(cfg.num_envs, threads), trainer_cfg, Extras(callbacks=[clock])).run()
-    return frames * ITERATIONS / (clock.ends[-1] - clock.ends[0])  # the first one warms up
+    played = len(script.targets) * len(script.targets[0])
+    trained_s, bare_s = sum(clock.training_s[1:]), sum(clock.bare_s[1:])
+    return frames * ITERATIONS / trained_s, played * ITERATIONS / bare_s
 
 
 def first_step_s(task: str) -> float:
@@ -150,13 +191,14 @@ def measure(task: str, rounds: int, console: Console) -> dict[str, list[float]]:
 
     for number in range(rounds):
         with console.status(f"round {number + 1} of {rounds}"):
-            rate, restarts = step_env(builder, actions)
-            bare = step_bare(builder, actions, restarts)
-            note("bare", bare)
-            note("make_batch", rate)
-            note("make_batch / bare", rate / bare)
+            in_env, in_bare, script = step_side_by_side(builder, actions)
+            frames = len(actions) * len(actions[0])
+            note("bare", frames / in_bare)
+            note("make_batch", frames / in_env)
+            note("make_batch / bare", in_bare / in_env)
             for algo in ("ppo", "ppo_fast"):
-                trained = train(builder, compose([f"task={task}", f"algo={algo}"]))
+                cfg = compose([f"task={task}", f"algo={algo}"])
+                trained, bare = train(builder, cfg, script)
                 note(f"training {algo}", trained)
                 note(f"training {algo} / bare", trained / bare)
             note("import to first step [s]", first_step_s(task))

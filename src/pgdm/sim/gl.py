@@ -15,7 +15,8 @@ from pgdm.errors import RenderError
 
 CURE = (
     "install one of the system packages libegl1 (EGL, also with NVIDIA's driver) or libosmesa6 "
-    "(software), on Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri libosmesa6"
+    "(software), on Debian and Ubuntu: "
+    "apt-get install libegl1 libopengl0 libgl1-mesa-dri libosmesa6"
 )
 _OFF = ("disable", "disabled", "off", "false", "0")
 _LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}

@@ -219,7 +219,6 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = VIDEO_FPS) 
         raise RenderError(f"no frames for {path}")
     height, width = pictures[0].shape[:2]
     with _replacing(path) as temp:
-        path.parent.mkdir(parents=True, exist_ok=True)
         writer = imageio_ffmpeg.write_frames(
             str(temp),
             (width, height),
@@ -255,6 +254,8 @@ def _replacing(path: Path) -> Iterator[Path]:
     """Give a name to write to; what was written takes the place of ``path`` in one step."""
     temp = path.with_name(f".{os.getpid()}.{path.name}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temp.touch()  # a folder that cannot be written is found before ffmpeg starts
         yield temp
         os.replace(temp, path)
     except (OSError, RuntimeError) as error:
