@@ -121,7 +121,9 @@ def plot(found: list[dict[str, Any]], path: Path) -> None:
             axis.set_ylabel(name.split("/")[1] if column == 0 else "")
             axis.set_xlim(0, FRAMES)
             axis.set_ylim(0, None if "return" in name else 1.02)
-    axes[0][0].legend(fontsize=8)
+    for axis in axes[0]:
+        if axis.has_data():
+            axis.legend(fontsize=8)
     figure.suptitle(f"{FRAMES:,} frames, one seed (the paper's figures are after 50,000,000)")
     figure.tight_layout()
     figure.savefig(path, dpi=80)
