@@ -1,6 +1,6 @@
 # Every target sets up .venv from nothing and is quick when nothing changed.
 #
-#   make run     the main job on real data: about five minutes of training, then a table and a video
+#   make run     the main job on real data: minutes of training, then a table and a video
 #   make test    the tests
 #   make check   lint, format, types, layers
 #   make slow    the tests that take minutes
