@@ -2,9 +2,10 @@
 
     python benchmark/throughput.py [--task hammer-use1] [--rounds 5] [--write]
 
-Beside everything runs bare ``mujoco.batch.Batch`` doing the very same physics (targets, gravity
-compensation, restarts) with nothing around it: step by step beside the batch env, and after each
-iteration of a training, so that the machine's drift hits both alike.
+Beside everything runs bare ``mujoco.batch.Batch`` doing the very same steps (targets, gravity
+compensation, restarts, from the same states) with nothing around it: step by step beside the batch
+env, and after each iteration of a training that iteration's steps again, so that the machine's
+drift hits both alike.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
 
@@ -29,17 +30,23 @@ import torch
 from mujoco import batch as mujoco_batch
 from rich.console import Console
 from rich.table import Table
+from torch import Tensor
+from torchrl_loss import as_tensordict, clip_ppo_loss
 
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.store import compose
+from pgdm.envs.batch_env import BatchEnv
 from pgdm.envs.build import EnvBuilder
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
 from pgdm.rl.callback import Callback, Progress
+from pgdm.rl.loss import Samples, policy_loss, value_loss
+from pgdm.rl.networks import ActorCritic, NetworkCfg, gaussian_log_prob
 from pgdm.rl.trainer import Extras, Trainer, TrainerCfg
 from pgdm.tracking.provenance import versions
 
 RESULT = Path(__file__).parent / "results" / "throughput.json"
+NUM_ENVS = 64  # simulations of the batch env; a training has as many as its settings say
 STEPS = 64  # control steps of all simulations in one measurement
 CURRENT = mujoco.mjtStage.mjSTAGE_VEL
 ITERATIONS = 3  # of training in one measurement
@@ -54,112 +61,176 @@ print(time.perf_counter() - start)
 """
 
 
-def actions_of(builder: EnvBuilder, num_envs: int) -> list[torch.Tensor]:
-    """Return the same random actions around the warm start for every measurement."""
-    generator = torch.Generator().manual_seed(0)
-    warm = builder.mdp.actions.warm_start.float()
-    shape = (num_envs, len(warm))
-    return [warm + 0.2 * torch.randn(shape, generator=generator) for _ in range(STEPS)]
+@dataclass
+class Script:
+    """What the simulations of an env did: their states at the start, then step by step."""
+
+    states: np.ndarray
+    targets: list[np.ndarray] = field(default_factory=list)
+    restarted: list[np.ndarray] = field(default_factory=list)
+
+
+class Recorder:
+    """Writes down what an env asks of its simulations."""
+
+    def __init__(self, env: BatchEnv) -> None:
+        self._sim, self._step, self._reset = env.sim, env.sim.step, env.sim.reset
+        self.script = Script(env.sim.rows.copy())
+        # The env's own calls pass through here: two list entries a step, some microseconds.
+        env.sim.step, env.sim.reset = self._on_step, self._on_reset
+
+    def start(self) -> None:
+        """Begin a new script."""
+        self.script = Script(self._sim.rows.copy())
+
+    def _on_step(self, ctrl: np.ndarray) -> np.ndarray:
+        self.script.targets.append(ctrl.copy())
+        self.script.restarted.append(np.zeros(0, np.int64))
+        return self._step(ctrl)
+
+    def _on_reset(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        if self.script.restarted:  # the reset before the first step is in the states
+            self.script.restarted[-1] = ids.copy()
+        self._reset(ids, qpos, qvel)
 
 
 class Bare:
     """The physics of the batch env without pgdm: targets, gravity compensation, restarts."""
 
-    def __init__(self, builder: EnvBuilder, num_envs: int) -> None:
-        self._batch = mujoco_batch.Batch(builder.scene.model, num_envs, 0, persistent=True)
+    def __init__(self, builder: EnvBuilder, states: np.ndarray) -> None:
+        self._batch = mujoco_batch.Batch(builder.scene.model, len(states), 0, persistent=True)
         self._start, self._substeps = builder.mdp.start, builder.motion.substeps
         self._n = builder.scene.index.num_compensated
         self._ctrl, self._applied = self._batch.ctrl, self._batch.qfrc_applied
         self._bias = self._batch.bind("qfrc_bias")
         self._qpos, self._qvel = self._batch.qpos, self._batch.qvel
-        self._restart(np.arange(num_envs))
+        self._batch.state[:] = states
+        self._batch.forward(stage=CURRENT)
 
-    def _restart(self, ids: np.ndarray) -> None:
-        self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self._qpos[ids], self._qvel[ids] = self._start.qpos, self._start.qvel
-        self._batch.forward(ids, stage=CURRENT)
-
-    def step(self, target: np.ndarray, finished: np.ndarray) -> None:
+    def step(self, target: np.ndarray, restarted: np.ndarray) -> None:
         """Take one control step, then restart the rows that the env restarted."""
         self._ctrl[:] = target
         self._applied[:, : self._n] = self._bias[:, : self._n]
         self._batch.step(nstep=self._substeps, stage=CURRENT)
-        if len(finished):
-            self._restart(finished)
+        if len(restarted):
+            self._batch.reset(restarted, stage=mujoco.mjtStage.mjSTAGE_NONE)
+            self._qpos[restarted], self._qvel[restarted] = self._start.qpos, self._start.qvel
+            self._batch.forward(restarted, stage=CURRENT)
+
+    @property
+    def states(self) -> np.ndarray:
+        """All simulations' states, (N, nstate)."""
+        return self._batch.state
 
 
-@dataclass
-class Script:
-    """What was done in one measurement, to be done again."""
+def play(script: Script, builder: EnvBuilder) -> tuple[float, np.ndarray]:
+    """Do it again with the bare physics; return s, and the states (N, nstate) it ended in."""
+    bare = Bare(builder, script.states)
+    start = time.perf_counter()
+    for target, restarted in zip(script.targets, script.restarted, strict=True):
+        bare.step(target, restarted)
+    return time.perf_counter() - start, bare.states
 
-    targets: list[np.ndarray]
-    finished: list[np.ndarray]
 
-    def play(self, bare: Bare) -> float:
-        """Do it again; return s."""
+def step_side_by_side(builder: EnvBuilder, num_envs: int) -> tuple[float, float]:
+    """Step env and bare physics in turn, one control step each; return s of both."""
+    generator = torch.Generator().manual_seed(0)
+    env = builder.make(num_envs)
+    recorder, bare = Recorder(env), Bare(builder, env.sim.rows)
+    in_env = in_bare = 0.0
+    for _ in range(STEPS):
+        noise = torch.randn((num_envs, env.action_dim), generator=generator)
+        action = env.warm_start() + 0.2 * noise
         start = time.perf_counter()
-        for target, finished in zip(self.targets, self.finished, strict=True):
-            bare.step(target, finished)
-        return time.perf_counter() - start
-
-
-def step_side_by_side(
-    builder: EnvBuilder, actions: list[torch.Tensor]
-) -> tuple[float, float, Script]:
-    """Step env and bare physics in turn, one control step each; return s of both, and what."""
-    num_envs = len(actions[0])
-    env, bare = builder.make(num_envs), Bare(builder, num_envs)
-    t = torch.zeros(num_envs, dtype=torch.int64)
-    script, in_env, in_bare = Script([], []), 0.0, 0.0
-    for action in actions:
-        target = builder.mdp.actions.act(action, t).numpy()
-        start = time.perf_counter()
-        _, _, terminated, truncated, _ = env.step(action)
+        env.step(action)
         middle = time.perf_counter()
-        finished = (terminated | truncated).nonzero()[:, 0].numpy()
-        between = time.perf_counter()
-        bare.step(target, finished)
+        bare.step(recorder.script.targets[-1], recorder.script.restarted[-1])
         in_env += middle - start
-        in_bare += time.perf_counter() - between
-        script.targets.append(target)
-        script.finished.append(finished)
-    return in_env, in_bare, script
+        in_bare += time.perf_counter() - middle
+    if not np.array_equal(env.sim.rows, bare.states):
+        raise SystemExit("env and bare physics did not do the same")
+    return in_env, in_bare
 
 
 class Clock(Callback):
-    """Takes the time of each iteration, and plays the bare physics after each."""
+    """Takes the time of each iteration, and that of its steps with the bare physics after it."""
 
-    def __init__(self, builder: EnvBuilder, script: Script) -> None:
-        self._builder, self._script = builder, script
+    def __init__(self, builder: EnvBuilder, env: BatchEnv) -> None:
+        self._builder, self._env, self._recorder = builder, env, Recorder(env)
         self.training_s: list[float] = []
         self.bare_s: list[float] = []
         self._since = 0.0
 
     def on_start(self, trainer: Trainer) -> None:
         """Begin."""
-        self._since = time.perf_counter()
+        self._begin()
 
     def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
         """Note the iteration's time, and that of the bare physics."""
         self.training_s.append(time.perf_counter() - self._since)
-        bare = Bare(self._builder, len(self._script.targets[0]))
-        self.bare_s.append(self._script.play(bare))
+        seconds, states = play(self._recorder.script, self._builder)
+        if not np.array_equal(states, self._env.sim.rows):
+            raise SystemExit("training and bare physics did not do the same")
+        self.bare_s.append(seconds)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._recorder.start()
         self._since = time.perf_counter()
 
 
-def train(builder: EnvBuilder, cfg: ExperimentCfg, script: Script) -> tuple[float, float]:
-    """Return steps/s of collecting and learning, and of the bare physics in between.
+def train(builder: EnvBuilder, cfg: ExperimentCfg) -> tuple[float, float]:
+    """Return steps/s of collecting and learning, and of the bare physics doing the same steps.
 
     Evaluation and saving are left out; the first iteration warms up.
     """
     threads = len(os.sched_getaffinity(0))
     frames = cfg.num_envs * cfg.algo.steps_per_env
-    clock = Clock(builder, script)
+    env = builder.make(cfg.num_envs, threads)
+    clock = Clock(builder, env)
     trainer_cfg = TrainerCfg(cfg.algo, 0, frames * (ITERATIONS + 1), 0, 1e9, "cpu", threads)
-    Trainer(builder.make(cfg.num_envs, threads), trainer_cfg, Extras(callbacks=[clock])).run()
-    played = len(script.targets) * len(script.targets[0])
-    trained_s, bare_s = sum(clock.training_s[1:]), sum(clock.bare_s[1:])
-    return frames * ITERATIONS / trained_s, played * ITERATIONS / bare_s
+    Trainer(env, trainer_cfg, Extras(callbacks=[clock])).run()
+    done = frames * ITERATIONS
+    return done / sum(clock.training_s[1:]), done / sum(clock.bare_s[1:])
+
+
+def gradient_step_ms(cfg: ExperimentCfg) -> tuple[float, float]:
+    """Return ms of one minibatch's loss and gradient: pgdm's, and TorchRL's ``ClipPPOLoss``."""
+    generator = torch.Generator().manual_seed(0)
+    algo, obs_dim, action_dim = cfg.algo, 322, 30
+    network = NetworkCfg(obs_dim, action_dim, list(algo.hidden), algo.log_std_init, False, 10.0)
+    model = ActorCritic(network, generator)
+    obs = torch.randn(algo.minibatch_size, obs_dim, generator=generator)
+    action, mean = model.sample(obs, generator)
+    log_prob = gaussian_log_prob(mean, model.log_std.detach(), action)
+    advantage, target = torch.randn((2, algo.minibatch_size), generator=generator)
+    batch = Samples(obs, action, log_prob, advantage, target)
+    theirs = clip_ppo_loss(model, algo)
+    data = as_tensordict(batch, theirs)
+
+    def ours() -> Tensor:
+        policy = policy_loss(
+            model.mean(obs),
+            model.log_std,
+            batch,
+            clip=algo.clip,
+            entropy_coef=algo.entropy_coef,
+            normalize_advantage=algo.normalize_advantage,
+        )
+        return policy.total + algo.value_coef * value_loss(model.value(obs), target)
+
+    def torchrls() -> Tensor:
+        out = theirs(data)
+        return out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]
+
+    spent = {ours: 0.0, torchrls: 0.0}
+    for _ in range(STEPS):
+        for loss in spent:
+            model.zero_grad()
+            start = time.perf_counter()
+            loss().backward()
+            spent[loss] += time.perf_counter() - start
+    return 1e3 * spent[ours] / STEPS, 1e3 * spent[torchrls] / STEPS
 
 
 def first_step_s(task: str) -> float:
@@ -183,7 +254,6 @@ def measure(task: str, rounds: int, console: Console) -> dict[str, list[float]]:
     # torch's helper threads spin after each parallel call, on a core that the physics needs.
     torch.set_num_threads(1)
     builder = env_builder(compose([f"task={task}"]), open_library())
-    actions = actions_of(builder, 64)
     figures: dict[str, list[float]] = {}
 
     def note(name: str, value: float) -> None:
@@ -191,18 +261,21 @@ def measure(task: str, rounds: int, console: Console) -> dict[str, list[float]]:
 
     for number in range(rounds):
         with console.status(f"round {number + 1} of {rounds}"):
-            in_env, in_bare, script = step_side_by_side(builder, actions)
-            frames = len(actions) * len(actions[0])
-            note("bare", frames / in_bare)
-            note("make_batch", frames / in_env)
+            in_env, in_bare = step_side_by_side(builder, NUM_ENVS)
+            note("bare", STEPS * NUM_ENVS / in_bare)
+            note("make_batch", STEPS * NUM_ENVS / in_env)
             note("make_batch / bare", in_bare / in_env)
             for algo in ("ppo", "ppo_fast"):
                 cfg = compose([f"task={task}", f"algo={algo}"])
-                trained, bare = train(builder, cfg, script)
+                trained, bare = train(builder, cfg)
                 note(f"training {algo}", trained)
+                note(f"bare, the steps of training {algo}", bare)
                 note(f"training {algo} / bare", trained / bare)
-            note("import to first step [s]", first_step_s(task))
-            note("peak memory of a run [MiB]", peak_memory_mib(task))
+            own, torchrls = gradient_step_ms(compose([f"task={task}"]))
+            note("loss and gradient, one thread (ms)", own)
+            note("the same by TorchRL's ClipPPOLoss (ms)", torchrls)
+            note("import to first step (s)", first_step_s(task))
+            note("peak memory of a run (MiB)", peak_memory_mib(task))
     return figures
 
 
@@ -219,7 +292,7 @@ def main() -> None:
     for name in ("figure", "median", "min", "max"):
         table.add_column(name, justify="left" if name == "figure" else "right")
     for name, values in figures.items():
-        digits = 2 if "/ bare" in name or "[s]" in name else 0
+        digits = 2 if "/ bare" in name or "s)" in name else 0
         row = (statistics.median(values), min(values), max(values))
         table.add_row(name, *(f"{value:,.{digits}f}" for value in row))
     console.print(table)

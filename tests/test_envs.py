@@ -200,6 +200,16 @@ def test_evaluation_draws_other_boxes_than_training() -> None:
     assert not np.array_equal(*widths)
 
 
+def test_restarted_rows_show_what_the_simulations_hold() -> None:
+    env = pgdm.make_batch("dmanus-sim2real", num_envs=3, num_threads=1)
+    for _ in range(3):
+        env.step(env.warm_start().repeat(3, 1))
+    rows = np.array([0, 2])
+    obs = env.reset(rows)
+    expected = env.mdp.observe(env.sim.read(rows), torch.zeros(2, dtype=torch.int64))
+    assert torch.equal(obs[torch.from_numpy(rows)], expected)
+
+
 def test_weights_change_by_name_only() -> None:
     env = pgdm.make_batch("hammer-use1", num_envs=1, num_threads=1)
     env.set_weights({"tracking": 0.0})

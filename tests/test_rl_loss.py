@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torchrl_loss import as_tensordict, clip_ppo_loss
 
 from pgdm.rl.loss import PolicyLoss, Samples, advantages, policy_loss, value_loss
 from pgdm.rl.networks import ActorCritic, NetworkCfg, gaussian_entropy, gaussian_log_prob
@@ -147,7 +148,8 @@ def model_and_batch() -> tuple[ActorCritic, Samples]:
     cfg = NetworkCfg(D, A, [16, 8], -0.5, normalize_observations=False, observation_clip=10.0)
     model = ActorCritic(cfg, generator)
     obs = torch.randn(M, D, generator=generator)
-    action, log_prob = model.sample(obs, generator)
+    action, mean = model.sample(obs, generator)
+    log_prob = gaussian_log_prob(mean, model.log_std.detach(), action)
     log_prob = log_prob + 0.3 * torch.randn(M, generator=generator)
     advantage, target = torch.randn(M, generator=generator), torch.randn(M, generator=generator)
     return model, Samples(obs, action, log_prob, advantage, target)
@@ -165,55 +167,9 @@ def gradients(model: nn.Module, loss: Tensor) -> list[Tensor]:
 
 
 def test_equals_torchrl() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from tensordict import TensorDict
-        from tensordict.nn import TensorDictModule
-        from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
-        from torchrl.objectives import ClipPPOLoss
-
     model, batch = model_and_batch()
-
-    class LocScale(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.policy, self.log_std = model.policy, model.log_std
-
-        def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-            mean = self.policy(obs)
-            return mean, self.log_std.exp().expand_as(mean)
-
-    actor = ProbabilisticActor(
-        TensorDictModule(LocScale(), ["observation"], ["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=IndependentNormal,
-        return_log_prob=True,
-    )
-    loss = ClipPPOLoss(
-        actor,
-        ValueOperator(model.critic, in_keys=["observation"]),
-        clip_epsilon=PAPER.clip,
-        entropy_bonus=True,
-        entropy_coeff=PAPER.entropy_coef,
-        critic_coeff=PAPER.value_coef,
-        loss_critic_type="l2",
-        normalize_advantage=True,
-        clip_value=False,
-        separate_losses=False,
-        reduction="mean",
-        functional=False,
-    )
-    data = TensorDict(
-        {
-            "observation": batch.obs,
-            "action": batch.action,
-            loss.tensor_keys.sample_log_prob: batch.log_prob,
-            "advantage": batch.advantage[:, None],
-            "value_target": batch.target[:, None],
-        },
-        batch_size=[M],
-    )
-    out = loss(data)
+    loss = clip_ppo_loss(model, PAPER)
+    out = loss(as_tensordict(batch, loss))
     total = out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]
     whole, policy, error = ours(model, batch)
     close = {"rtol": 1e-4, "atol": 1e-6}

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from pgdm.errors import RunError
-from pgdm.rl.networks import ActorCritic, NetworkCfg
+from pgdm.rl.networks import ActorCritic, NetworkCfg, gaussian_log_prob
 from pgdm.seeding import torch_stream
 
 CFG = NetworkCfg(
@@ -67,12 +67,19 @@ def test_the_warm_start_is_the_means_bias() -> None:
 def test_samples_follow_the_gaussian_and_are_not_clipped() -> None:
     cfg = replace(CFG, obs_dim=2, action_dim=2, hidden=[4], log_std_init=0.0)
     model = ActorCritic(cfg, torch_stream(0, "weights"), torch.tensor([0.0, 2.0]))
-    action, log_prob = model.sample(torch.zeros(20_000, 2), torch_stream(0, "actions"))
+    action, mean = model.sample(torch.zeros(20_000, 2), torch_stream(0, "actions"))
     torch.testing.assert_close(action.mean(0), torch.tensor([0.0, 2.0]), atol=0.03, rtol=0)
     torch.testing.assert_close(action.std(0), torch.ones(2), atol=0.03, rtol=0)
-    normal = torch.distributions.Normal(torch.tensor([0.0, 2.0]), 1.0)
+    torch.testing.assert_close(mean, torch.tensor([[0.0, 2.0]]).expand(20_000, 2))
+    assert not action.requires_grad
+
+
+def test_log_prob_is_that_of_independent_normals() -> None:
+    mean, log_std = torch.tensor([[0.0, 2.0]]), torch.tensor([0.0, -1.0])
+    action = torch.randn(50, 2, generator=torch_stream(0, "test"))
+    normal = torch.distributions.Normal(mean, log_std.exp())
+    log_prob = gaussian_log_prob(mean, log_std, action)
     torch.testing.assert_close(log_prob, normal.log_prob(action).sum(1))
-    assert not log_prob.requires_grad
 
 
 def test_act_samples_from_the_given_stream() -> None:

@@ -37,11 +37,12 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 def angle(p: Tensor, q: Tensor) -> Tensor:
     """Return the angle of the rotation between p and q, (...), rad in [0, pi].
 
-    Computed with atan2, which keeps its accuracy near 0 where arccos loses it; the sign of a
-    quaternion does not matter.
+    Half of it lies between p and q as unit vectors, of which |p - q| and |p + q| are twice the
+    sine and cosine of its half: accurate near 0, where the arccos of their product is not. The
+    sign of a quaternion does not matter.
     """
-    d = multiply(conjugate(p), q)
-    return 2.0 * torch.atan2(torch.linalg.vector_norm(d[..., 1:], dim=-1), d[..., 0].abs())
+    apart, together = torch.linalg.vector_norm(torch.stack((p - q, p + q)), dim=-1)
+    return 4.0 * torch.atan2(torch.minimum(apart, together), torch.maximum(apart, together))
 
 
 def to_matrix(q: Tensor) -> Tensor:

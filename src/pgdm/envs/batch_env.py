@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from pgdm.mdp.context import StepContext
 from pgdm.mdp.metrics import Episodes, episode_metrics
 from pgdm.mdp.observations import Observe
 from pgdm.mdp.recipe import Recipe
-from pgdm.mdp.rewards import object_error
 from pgdm.motion.reference import ObjectReference
 from pgdm.pregrasp.sources import StartState
 from pgdm.sim.batch import SimBatch, SimState
@@ -64,16 +64,20 @@ class BatchEnv:
         self.action_dim = sim.scene.index.num_actuators
         self._randomize, self._auto_reset = randomize, auto_reset
         self._history = History(sim, dump_dir)
-        self._weights = {term.name: term.weight for term in mdp.recipe.rewards}
+        self._names = [term.name for term in mdp.recipe.rewards]
+        self._weights = torch.tensor(
+            [[term.weight] for term in mdp.recipe.rewards], dtype=torch.float64
+        )
         n, horizon = self.num_envs, len(mdp.reference)
         self._t = torch.zeros(n, dtype=torch.int64)
         self._return = torch.zeros(n, dtype=torch.float64)
-        sums = [f"{kind}/{name}" for kind in ("term", "raw") for name in self._weights]
-        self._term_sums = {name: torch.zeros(n, dtype=torch.float64) for name in sums}
+        # Of each reward term, (2, K, N): weighted, then raw, summed over the episode.
+        self._term_sums = torch.zeros(2, len(self._names), n, dtype=torch.float64)
         self._pos = torch.zeros(n, horizon, 3, dtype=torch.float64)
         self._quat = torch.zeros(n, horizon, 4, dtype=torch.float64)
         self._all = np.arange(n)
         self._rows = torch.arange(n)
+        self._start = self._read_start()
         self._obs = self.reset()
         self.obs_dim = self._obs.shape[1]
 
@@ -89,18 +93,15 @@ class BatchEnv:
             self._randomize.apply(self.sim, ids)
         self.sim.reset(ids, self.mdp.start.qpos, self.mdp.start.qvel)
         rows = torch.from_numpy(ids)
-        state = self.sim.read(ids)
         self._t[rows] = 0
         self._return[rows] = 0.0
-        for total in self._term_sums.values():
-            total[rows] = 0.0
-        self._pos[rows, 0], self._quat[rows, 0] = state.object_pos, state.object_quat
-        fresh = self.mdp.observe(state, self._t[rows])
+        self._term_sums[:, :, rows] = 0.0
+        obs, self._pos[rows, 0], self._quat[rows, 0] = self._start
         if len(ids) == self.num_envs:
-            self._obs = fresh
+            self._obs = obs.repeat(self.num_envs, 1)
         else:
             self._obs = self._obs.clone()
-            self._obs[rows] = fresh
+            self._obs[rows] = obs
         return self._obs
 
     def step(self, action: Tensor) -> StepResult:
@@ -120,38 +121,45 @@ class BatchEnv:
         self._history.record(ctrl)
         diverged = torch.from_numpy(self.sim.step(ctrl))
         state = self.sim.read()
-        diverged |= ~torch.isfinite(state.qpos).all(1) | ~torch.isfinite(state.object_vel).all(1)
+        # A sum is finite only if all its parts are, and costs a tenth of looking at each.
+        sums = state.qpos.sum(1) + state.object_vel.sum(1)
+        if not math.isfinite(float(sums.sum())):
+            diverged |= ~torch.isfinite(sums)
+        some_diverged = bool(diverged.any())
         self._t = self._t + 1
         context = self._context(state)
-        raw = {term.name: term.value(context) for term in self.mdp.recipe.rewards}
-        terms = {name: self._weights[name] * value for name, value in raw.items()}
-        ends = {end.name: end.reached(context) & ~diverged for end in self.mdp.recipe.ends}
-        terminated = torch.stack(tuple(ends.values())).any(0)
-        error = object_error(context)
-        if diverged.any():
-            terms = {name: value.masked_fill(diverged, 0.0) for name, value in terms.items()}
-            raw = {name: value.masked_fill(diverged, 0.0) for name, value in raw.items()}
-        reward = torch.stack(tuple(terms.values())).sum(0)
+        raw = torch.stack([term.value(context) for term in self.mdp.recipe.rewards])  # (K, N)
+        ends = {end.name: end.reached(context) for end in self.mdp.recipe.ends}
         final = self.mdp.observe(state, self._t)
-        if diverged.any():
+        if some_diverged:
+            raw = raw.masked_fill(diverged, 0.0)
+            ends = {name: reached & ~diverged for name, reached in ends.items()}
             final[diverged] = self._obs[diverged]
             rows = diverged.nonzero()[:, 0]
             self._history.dump(rows.tolist(), self._t[rows].tolist())
-        self._account(state, reward, terms, raw, diverged)
+        terms = self._weights * raw
+        reward = terms.sum(0)
+        terminated = torch.stack(tuple(ends.values())).any(0)
+        self._return += reward
+        self._term_sums += torch.stack((terms, raw))
+        self._pos[self._rows, self._t], self._quat[self._rows, self._t] = self._poses(
+            state, diverged if some_diverged else None
+        )
+        done = terminated | diverged
+        finished = done.nonzero()[:, 0]
         info: dict[str, Any] = {
             "final_obs": final,
             "qpos": state.qpos,
-            "object_error_m": error,
-            "success": error <= self.mdp.recipe.metrics.success_threshold_m,
-            "terms": terms,
-            "raw_terms": raw,
+            "object_error_m": context.object_error,
+            "success": context.object_error <= self.mdp.recipe.metrics.success_threshold_m,
+            "terms": dict(zip(self._names, terms, strict=True)),
+            "raw_terms": dict(zip(self._names, raw, strict=True)),
             "ends": ends,
+            "episodes": self._metrics(finished, diverged, ends) if len(finished) else {},
         }
-        done = terminated | diverged
-        info["episodes"] = self._finish(done, diverged, ends)
         self._obs = final
-        if self._auto_reset and done.any():
-            self.reset(done.nonzero()[:, 0].numpy())
+        if self._auto_reset and len(finished):
+            self.reset(finished.numpy())
         return self._obs, reward.float(), terminated, diverged, info
 
     def set_weights(self, weights: dict[str, float]) -> None:
@@ -160,14 +168,14 @@ class BatchEnv:
         Raises:
             UnknownNameError: if there is no such term.
         """
-        for name in weights:
-            if name not in self._weights:
-                raise UnknownNameError("reward term", name, self._weights)
-        self._weights.update(weights)
+        for name, weight in weights.items():
+            if name not in self._names:
+                raise UnknownNameError("reward term", name, self._names)
+            self._weights[self._names.index(name)] = weight
 
     def object_error(self) -> Tensor:
         """Return the object's current distance from its target, (N,) m."""
-        return object_error(self._context(self.sim.read()))
+        return self._context(self.sim.read()).object_error
 
     def reseed(self, seed: int) -> None:
         """Restart the stream of the per-reset variation; tasks without one ignore it."""
@@ -185,10 +193,10 @@ class BatchEnv:
             "t": self._t.clone(),
             "obs": self._obs.clone(),
             "return": self._return.clone(),
-            "term_sums": {name: value.clone() for name, value in self._term_sums.items()},
+            "term_sums": self._term_sums.clone(),
             "pos": self._pos.clone(),
             "quat": self._quat.clone(),
-            "weights": dict(self._weights),
+            "weights": self._weights.clone(),
         }
         if self._randomize is not None:
             state["randomize"] = self._randomize.state_dict()
@@ -201,9 +209,19 @@ class BatchEnv:
         self.sim.restore(state["rows"].numpy())
         self._t, self._obs = state["t"].clone(), state["obs"].clone()
         self._return = state["return"].clone()
-        self._term_sums = {name: value.clone() for name, value in state["term_sums"].items()}
+        self._term_sums = state["term_sums"].clone()
         self._pos, self._quat = state["pos"].clone(), state["quat"].clone()
-        self._weights = dict(state["weights"])
+        self._weights = state["weights"].clone()
+
+    def _read_start(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the observation (D,) and the object's position (3,) and quaternion (4,) at reset.
+
+        They are the same after every reset: what a ``Randomizer`` varies shows in contacts only.
+        """
+        one = self._all[:1]
+        self.sim.reset(one, self.mdp.start.qpos, self.mdp.start.qvel)
+        state = self.sim.read(one)
+        return self.mdp.observe(state, self._t[:1])[0], state.object_pos[0], state.object_quat[0]
 
     def _context(self, state: SimState) -> StepContext:
         reference = self.mdp.reference
@@ -216,34 +234,25 @@ class BatchEnv:
             start_height=self._pos[:, 0, 2],
         )
 
-    def _account(
-        self,
-        state: SimState,
-        reward: Tensor,
-        terms: dict[str, Tensor],
-        raw: dict[str, Tensor],
-        diverged: Tensor,
-    ) -> None:
-        self._return += reward
-        for name, value in terms.items():
-            self._term_sums[f"term/{name}"] += value
-            self._term_sums[f"raw/{name}"] += raw[name]
-        keep = diverged[:, None]  # a diverged simulation keeps its last sane pose
-        last = self._t - 1
-        self._pos[self._rows, self._t] = torch.where(
-            keep, self._pos[self._rows, last], state.object_pos
-        )
-        self._quat[self._rows, self._t] = torch.where(
-            keep, self._quat[self._rows, last], state.object_quat
+    def _poses(self, state: SimState, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the object's pose, of a diverged simulation its last sane one."""
+        if diverged is None:
+            return state.object_pos, state.object_quat
+        last, keep = self._t - 1, diverged[:, None]
+        return (
+            torch.where(keep, self._pos[self._rows, last], state.object_pos),
+            torch.where(keep, self._quat[self._rows, last], state.object_quat),
         )
 
-    def _finish(self, done: Tensor, diverged: Tensor, ends: dict[str, Tensor]) -> dict[str, Tensor]:
-        if not done.any():
-            return {}
-        episodes = Episodes(self._pos[done], self._quat[done], self._t[done])
+    def _metrics(
+        self, rows: Tensor, diverged: Tensor, ends: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """Return the metrics of the episodes that finished in ``rows`` (k,), each (k,)."""
+        episodes = Episodes(self._pos[rows], self._quat[rows], self._t[rows])
         metrics = episode_metrics(episodes, self.mdp.reference, self.mdp.recipe.metrics)
-        metrics["return"] = self._return[done].clone()
-        metrics["diverged"] = diverged[done].double()
-        metrics |= {f"end/{name}": flag[done].double() for name, flag in ends.items()}
-        metrics |= {name: total[done] for name, total in self._term_sums.items()}
+        metrics["return"] = self._return[rows]
+        metrics["diverged"] = diverged[rows].double()
+        metrics |= {f"end/{name}": flag[rows].double() for name, flag in ends.items()}
+        for kind, sums in zip(("term", "raw"), self._term_sums[:, :, rows], strict=True):
+            metrics |= {f"{kind}/{n}": total for n, total in zip(self._names, sums, strict=True)}
         return metrics

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pgdm import rotations
 from pgdm.mdp.context import StepContext
 
 
@@ -27,23 +26,12 @@ class RewardCfg:
     """Height above the start at which object and target count as lifted, m."""
 
 
-def object_error(c: StepContext) -> Tensor:
-    """Return the distance of the object's centre of mass from its target, (n,) m."""
-    return torch.linalg.vector_norm(c.target_pos - c.state.object_pos, dim=-1)
-
-
-def object_angle(c: StepContext) -> Tensor:
-    """Return the angle between the object and its target, (n,) rad in [0, pi]."""
-    return rotations.angle(c.state.object_quat, c.target_quat)
-
-
 def tracking(c: StepContext, scale: float, orientation_scale: float) -> Tensor:
     """Return exp(-scale (e + orientation_scale angle/pi)), (n,) in (0, 1]."""
-    angle = object_angle(c) / torch.pi
-    return torch.exp(-scale * (object_error(c) + orientation_scale * angle))
+    return torch.exp(-scale * (c.object_error + orientation_scale / torch.pi * c.object_angle))
 
 
 def lift(c: StepContext, height_m: float) -> Tensor:
     """Return 1 where object and target are both ``height_m`` above the start, (n,)."""
-    level = c.start_height + height_m
-    return ((c.target_pos[:, 2] >= level) & (c.state.object_pos[:, 2] >= level)).double()
+    lower = torch.minimum(c.target_pos[:, 2], c.state.object_pos[:, 2])
+    return (lower >= c.start_height + height_m).double()

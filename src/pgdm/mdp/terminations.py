@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from pgdm.mdp.context import StepContext
-from pgdm.mdp.rewards import object_error
 
 
 @dataclass(frozen=True)
@@ -20,7 +19,7 @@ class TerminationCfg:
 
 def object_lost(c: StepContext, max_error_m: float) -> Tensor:
     """Return whether the object is ``max_error_m`` or more away from its target, (n,) bool."""
-    return object_error(c) >= max_error_m
+    return c.object_error >= max_error_m
 
 
 def motion_ended(c: StepContext) -> Tensor:

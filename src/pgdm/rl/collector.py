@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pgdm.errors import RunError
-from pgdm.rl.networks import ActorCritic
+from pgdm.rl.networks import ActorCritic, gaussian_log_prob
 from pgdm.rl.vec_env import VecEnv
 
 
@@ -88,6 +88,7 @@ class Collector:
         self.env, self.model = env, model
         self.steps, self.generator = steps, generator
         self._rollout = Rollout.empty(steps, env)
+        self._mean = torch.zeros_like(self._rollout.action)
 
     @property
     def frames(self) -> int:
@@ -110,11 +111,13 @@ class Collector:
         with torch_threads(1), torch.no_grad():
             for t in range(self.steps):
                 self._step(rollout, t)
+            # All at once: many small operations between two steps of the physics cost more.
+            log_std = self.model.log_std.cpu()
+            rollout.log_prob = gaussian_log_prob(self._mean, log_std, rollout.action)
         return rollout
 
     def _step(self, rollout: Rollout, t: int) -> None:
-        action, log_prob = self.model.sample(rollout.obs[t], self.generator)
-        rollout.action[t], rollout.log_prob[t] = action, log_prob
+        rollout.action[t], self._mean[t] = self.model.sample(rollout.obs[t], self.generator)
         obs, reward, terminated, truncated, info = self.env.step(rollout.action[t])
         rollout.obs[t + 1], rollout.reward[t] = obs, reward
         rollout.terminated[t], rollout.truncated[t] = terminated, truncated

@@ -166,7 +166,7 @@ class Learner:
         return logged
 
     def _policy_gradient(self, samples: Samples, rows: Tensor) -> PolicyLoss:
-        minibatch = Samples(*(column[rows] for column in samples))
+        minibatch = Samples(*(column.index_select(0, rows) for column in samples))
         loss = policy_loss(
             self.model.mean(minibatch.obs),
             self.model.log_std,
@@ -179,7 +179,8 @@ class Learner:
         return loss
 
     def _value_gradient(self, samples: Samples, rows: Tensor) -> Tensor:
-        error = value_loss(self.model.value(samples.obs[rows]), samples.target[rows])
+        obs, target = (column.index_select(0, rows) for column in (samples.obs, samples.target))
+        error = value_loss(self.model.value(obs), target)
         (self.cfg.value_coef * error).backward()
         return error
 

@@ -106,15 +106,14 @@ class ActorCritic(nn.Module):
 
     @torch.no_grad()
     def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw actions (N, A) and their log-probabilities (N,) at raw observations (N, D).
+        """Draw actions (N, A) at raw observations (N, D); return them and the policy's means.
 
         The noise is drawn on the generator's device, so that a run with its networks elsewhere
         draws the same.
         """
         mean = self.mean(self.normalize(obs.to(self.device)))
         noise = torch.randn(mean.shape, generator=generator).to(self.device)
-        action = mean + self.log_std.exp() * noise
-        return action, gaussian_log_prob(mean, self.log_std, action)
+        return mean + self.log_std.exp() * noise, mean
 
     @torch.no_grad()
     def act(

@@ -59,6 +59,7 @@ class SimBatch:
         derived = ("geom_xpos", "xquat", "xipos", "cvel", "subtree_com")
         self._d = {name: self._batch.bind(name) for name in derived}
         self._scratch = mujoco.MjData(scene.model)
+        self._warnings = np.zeros(num_envs, np.int64)
         index = scene.index
         self._bodies = np.append(index.point_bodies, index.object_body)
         self._roots = scene.model.body_rootid[self._bodies]
@@ -84,6 +85,7 @@ class SimBatch:
     def reset(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Restart simulations ids (k,) from qpos (nq,) and qvel (nv,)."""
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._warnings[ids] = 0
         self._f["qpos"][ids] = qpos
         self._f["qvel"][ids] = qvel
         self._batch.forward(ids, stage=_CURRENT)
@@ -101,36 +103,43 @@ class SimBatch:
         n = self._compensated
         self._f["ctrl"][:] = ctrl
         self._f["qfrc_applied"][:, :n] = self._f["qfrc_bias"][:, :n]
-        before = self._f["warning"][..., 1].sum(axis=1)
-        failed = np.zeros(self.num_envs, bool)
+        failed: list[int] = []
         try:
             self._batch.step(nstep=self._substeps, stage=_CURRENT)
         except mujoco_batch.SimulationError as error:
-            failed[list(error.ids)] = True
-        return failed | (self._f["warning"][..., 1].sum(axis=1) != before)
+            failed = list(error.ids)
+        before, self._warnings = self._warnings, self._f["warning"][..., 1].sum(axis=1)
+        diverged = self._warnings != before
+        diverged[failed] = True
+        return diverged
 
     def read(self, ids: np.ndarray | None = None) -> SimState:
         """Return the current state of simulations ids, or of all."""
         rows = slice(None) if ids is None else ids
         index = self.scene.index
-        quat = self._d["xquat"][rows][:, self._bodies]
-        points = self._d["geom_xpos"][rows][:, index.point_geoms]
-        com = self._d["xipos"][rows][:, index.object_body].copy()
-        pos = np.concatenate((points, com[:, None]), axis=1)
-        cvel = self._d["cvel"][rows][:, self._bodies]  # angular, linear at the tree's COM
-        angular = cvel[..., :3]
-        arm = pos - self._d["subtree_com"][rows][:, self._roots]
-        linear = cvel[..., 3:] + np.cross(angular, arm)
-        vel = torch.from_numpy(np.concatenate((linear, angular), axis=-1))
-        quats = torch.from_numpy(quat)
+        pos = torch.from_numpy(
+            np.concatenate(
+                (
+                    self._d["geom_xpos"][rows].take(index.point_geoms, 1),
+                    self._d["xipos"][rows, index.object_body][:, None],
+                ),
+                axis=1,
+            )
+        )
+        quat = torch.from_numpy(self._d["xquat"][rows].take(self._bodies, 1))
+        cvel = torch.from_numpy(self._d["cvel"][rows].take(self._bodies, 1))
+        angular, linear_at_com = cvel[..., :3], cvel[..., 3:]  # linear: at the COM of the tree
+        arm = pos - torch.from_numpy(self._d["subtree_com"][rows].take(self._roots, 1))
+        linear = linear_at_com + torch.linalg.cross(angular, arm)
+        vel = torch.cat((linear, angular), -1)
         return SimState(
             qpos=torch.from_numpy(self._f["qpos"][rows].copy()),
             qvel=torch.from_numpy(self._f["qvel"][rows].copy()),
-            point_pos=torch.from_numpy(points),
-            point_quat=quats[:, :-1],
+            point_pos=pos[:, :-1],
+            point_quat=quat[:, :-1],
             point_vel=vel[:, :-1],
-            object_pos=torch.from_numpy(com),
-            object_quat=quats[:, -1],
+            object_pos=pos[:, -1],
+            object_quat=quat[:, -1],
             object_vel=vel[:, -1],
         )
 
@@ -147,6 +156,7 @@ class SimBatch:
             )
         self.rows[:] = rows
         self._batch.forward(stage=_CURRENT)
+        self._warnings = self._f["warning"][..., 1].sum(axis=1)
 
     def contact(self) -> tuple[np.ndarray, np.ndarray]:
         """Return friction (N, 3) and half-width (N,) m of the randomised geom."""
