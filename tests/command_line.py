@@ -51,7 +51,11 @@ def command(name: str, *arguments: str) -> Outcome:
 
 
 def process(
-    name: str, *arguments: str, env: dict[str, str] | None = None, before: str = "pass"
+    name: str,
+    *arguments: str,
+    env: dict[str, str] | None = None,
+    before: str = "pass",
+    timeout_s: float = 300,
 ) -> Outcome:
     """Run a command as a process of its own, after the Python statement ``before``."""
     module = {"pgdm-run": "run", "pgdm": "main"}[name]
@@ -61,7 +65,7 @@ def process(
         capture_output=True,
         text=True,
         env=os.environ | (env or {}),
-        timeout=300,
+        timeout=timeout_s,
         check=False,
     )
     return Outcome(done.returncode, done.stdout, done.stderr)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -322,3 +323,25 @@ def test_a_signal_saves_and_the_same_command_goes_on(
 
 def test_settings_are_plain_data() -> None:
     assert json.loads(json.dumps(dataclasses.asdict(compose())))["task"]["id"] == "hammer-use1"
+
+
+def test_a_signal_that_ends_a_fetch_shows_in_the_exit_code(
+    library_home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted_fetch(*_args: object, progress: Callable[[str, int, int], None]) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        progress("a download", 1, 2)
+
+    monkeypatch.setattr("pgdm.experiment.ensure", interrupted_fetch)
+    outcome = command("pgdm-run", *TINY, "run_dir=run")
+    assert outcome.code == 143
+    assert "goes on from its last checkpoint" in outcome.err
+    assert "Traceback" not in outcome.err
+
+
+def test_a_policy_is_measured_with_another_seed(library_home: Path) -> None:
+    assert command("pgdm-run", "--offline", *TINY, "run_dir=run").code == 0
+    one, again, other = (
+        command("pgdm", "eval", "run", "--offline", "--seed", seed).out for seed in ("1", "1", "2")
+    )
+    assert one == again != other

@@ -61,7 +61,6 @@ def test_kinds_of_tracker(tmp_path: Path) -> None:
     tracker = open_tracker(TrackingCfg("none", None, "pgdm"), folder, FACTS)
     assert isinstance(tracker, NullTracker)
     track(tracker)
-    tracker.artifact(folder.path / "config.yaml")
     tracker.finish("finished")
     assert [p.name for p in folder.path.iterdir()] == ["config.yaml"]
     with pytest.raises(UnknownNameError, match=r"'mlfow'.*mlflow"):
@@ -77,7 +76,6 @@ def test_one_method_makes_a_tracker(tmp_path: Path) -> None:
 
     mine = Mine()
     mine.log({"a": 1.0}, 5)
-    mine.artifact(tmp_path)
     mine.video(tmp_path, tmp_path, 5)
     mine.finish("finished")
     assert seen == {5: {"a": 1.0}}
@@ -95,7 +93,8 @@ def test_a_run_as_mlflow_shows_it(tmp_path: Path) -> None:
     videos = folder.path / "videos"
     film = videos / "frames_000000040960.mp4"
     tracker.video(film, film.with_suffix(".png"), LENGTH * STEP)
-    tracker.artifact(folder.path / "gone.txt")
+    gone = videos / "frames_000000000000.mp4"
+    tracker.video(gone, gone.with_suffix(".png"), 0)
     tracker.finish("finished")
 
     store = Store.open(store_uri(tmp_path / "runs"), "pgdm")

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import harmonic_mean
 from typing import Any
 
 from pgdm.config.saved import check_run_dir, save_config
@@ -151,19 +152,19 @@ class Run(Callback):
         (self.dir / RESULT).unlink(missing_ok=True)  # it tells of an earlier end, not of this one
         self._trainer = trainer
         self._tracker = open_tracker(self.cfg.tracking, RunFolder(self.dir), self._facts)
-        status = "failed"
+        status, patience_s = "failed", 60.0
         try:
             outcome = trainer.run()
             status = outcome.status
             return self._finish(outcome)
         except KeyboardInterrupt:
-            status = "interrupted"
+            status, patience_s = "interrupted", 2.0  # who asks a second time wants to go now
             raise
         except (PgdmError, OSError, MemoryError) as error:
             self._write_result("failed", trainer.progress, {}, str(error))
             raise
         finally:
-            self._tracker.finish(status)
+            self._tracker.finish(status, patience_s)
 
     def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
         """Record an iteration."""
@@ -240,7 +241,9 @@ class Run(Callback):
     def _write_result(
         self, status: str, progress: Progress, metrics: dict[str, float], error: str = ""
     ) -> None:
-        steps = progress.frames / progress.elapsed_s if progress.elapsed_s else 0.0
+        rates = [
+            float(r["train/steps_per_s"]) for r in self._log.read() if "train/steps_per_s" in r
+        ]
         video = self._video(progress)
         write_json(
             self.dir / RESULT,
@@ -251,7 +254,8 @@ class Run(Callback):
                 "frames": progress.frames,
                 "total_frames": progress.total_frames,
                 "wall_time_s": round(progress.elapsed_s, 1),
-                "steps_per_s": round(steps, 1),
+                # Of collecting and learning; wall_time_s has evaluations and films too.
+                "steps_per_s": round(harmonic_mean(rates), 1) if rates else 0.0,
                 "metrics": {k: v for k, v in metrics.items() if v == v},
                 "video": str(video.relative_to(self.dir)) if video.exists() else None,
                 **self._facts,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -36,6 +36,8 @@ class EvalRequest:
     """Whether to leave the sampled policy out."""
     best: bool
     """Of a run folder: the best checkpoint instead of the last."""
+    seed: int | None
+    """Of the action noise and the task's own randomness; None: the run's."""
     offline: bool
     """Whether missing assets are an error instead of being fetched."""
 
@@ -48,6 +50,8 @@ def evaluate_policy(request: EvalRequest) -> int:
     """
     run_dir, checkpoint = find_checkpoint(request.path, request.best)
     cfg = load_config(run_dir)
+    if request.seed is not None:
+        cfg = replace(cfg, seed=request.seed)
     policy, state = load_policy(checkpoint), read_checkpoint(checkpoint)
     frames = int(state["frames"])
     library = ensure(cfg.task.motion, request.offline or cfg.offline, notify)

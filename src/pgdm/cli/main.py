@@ -99,12 +99,15 @@ def evaluate(
     best: Annotated[
         bool, typer.Option("--best", help="Of a run: its best checkpoint, not its last.")
     ] = False,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Of the noise; by default the run's.")
+    ] = None,
     offline: Annotated[bool, typer.Option("--offline", help="Never use the network.")] = False,
 ) -> None:
     """Measure a trained policy."""
     from pgdm.cli.evaluate import EvalRequest, evaluate_policy
 
-    request = EvalRequest(run, episodes, video, deterministic, best, offline)
+    request = EvalRequest(run, episodes, video, deterministic, best, seed, offline)
     raise typer.Exit(evaluate_policy(request))
 
 

@@ -56,9 +56,21 @@ def _main(flags: Flags, debug: bool) -> int:
     return _run_all(_checked(jobs), debug)
 
 
+class _NoticeHandler(logging.Handler):
+    """Prints as ``notify`` does, above the live line of progress and not into it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        from pgdm.cli.train import notify
+
+        notify(self.format(record))
+
+
 def set_up_logging(debug: bool) -> None:
     """Send what modules log to stderr, each as one line."""
-    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+    handler = _NoticeHandler()
+    logging.basicConfig(
+        format="%(levelname)s: %(message)s", level=logging.WARNING, handlers=[handler]
+    )
     logging.getLogger("pgdm").setLevel(logging.DEBUG if debug else logging.WARNING)
     # Warnings of libraries are for developers.
     logging.captureWarnings(True)

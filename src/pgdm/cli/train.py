@@ -6,6 +6,7 @@ import sys
 
 from rich.console import Console
 
+from pgdm.cli.errors import report
 from pgdm.cli.progress import ProgressView
 from pgdm.cli.stop import StopRequest
 from pgdm.cli.summary import summary_table
@@ -30,7 +31,11 @@ def train(cfg: ExperimentCfg) -> int:
     """
     view = ProgressView(cfg.task.id, _PROGRESS)
     with StopRequest() as stop:
-        result = run_experiment(cfg, (view,), stop, notify)
+        try:
+            result = run_experiment(cfg, (view,), stop, notify)
+        except KeyboardInterrupt as error:
+            report(error, debug=False)
+            return stop.exit_code
     if result.status == "interrupted":
         print(
             f"stopped and saved at {result.frames:,} of {cfg.total_frames:,} frames in "

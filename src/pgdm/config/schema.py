@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 from pgdm.config.strict import flatten
 from pgdm.errors import ConfigError, UnknownNameError
-from pgdm.mdp.actions import ActionCfg
-from pgdm.mdp.observations import ObsCfg
+from pgdm.mdp.actions import KINDS, ActionCfg
+from pgdm.mdp.observations import LAYOUTS, ObsCfg
 from pgdm.methods import METHODS, MethodCfg
 from pgdm.motion.reference import FRAMES, ReferenceCfg
 from pgdm.pregrasp.sources import SOURCES, PregraspCfg
 from pgdm.rl.checkpoint import CheckpointCfg
 from pgdm.rl.evaluate import EvalCfg
-from pgdm.rl.learner import PPOCfg
+from pgdm.rl.learner import PPOCfg, check_batch
 from pgdm.sim.scene import HandCfg, SimCfg, TaskCfg
-from pgdm.tracking.tracker import TrackingCfg
+from pgdm.tracking import TRACKERS, TrackingCfg
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class ExperimentCfg:
         flat = flatten(dataclasses.asdict(self))
         _check_choices(flat)
         _check_ranges(flat)
-        self._check_batch()
+        check_batch(self.algo, self.num_envs)
         self._check_hand()
         self._check_placements()
         if self.device.partition(":")[0] not in ("cpu", "cuda"):
@@ -94,16 +94,6 @@ class ExperimentCfg:
             raise ConfigError("run_dir is empty; name a folder, or null for the default")
         if not self.budget.strip():
             raise ConfigError("budget is empty; say smoke, reduced or paper")
-
-    def _check_batch(self) -> None:
-        collected = self.num_envs * self.algo.steps_per_env
-        size = self.algo.minibatch_size
-        product = f"num_envs {self.num_envs} * algo.steps_per_env {self.algo.steps_per_env}"
-        if size > collected or collected % size:
-            raise ConfigError(
-                f"algo.minibatch_size {size} does not divide the {collected} samples of an "
-                f"iteration ({product}); choose a divisor such as {_divisor(collected, size)}"
-            )
 
     def _check_hand(self) -> None:
         hand = self.hand
@@ -139,11 +129,11 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "pregrasp.fallback": SOURCES,
     "method.name": tuple(METHODS),
     "ablation.name": ("none",),
-    "obs.layout": ("released", "paper"),
-    "action.kind": ("absolute", "residual"),
+    "obs.layout": tuple(LAYOUTS),
+    "action.kind": tuple(KINDS),
     "reference.frame": FRAMES,
     "hand.gravity_compensation": ("all", "base"),
-    "tracking.kind": ("mlflow", "none"),
+    "tracking.kind": tuple(TRACKERS),
     "resume": ("auto", "never", "must"),
 }
 
@@ -217,8 +207,3 @@ def check_device(device: str) -> None:
 
         if not torch.cuda.is_available():
             raise ConfigError(f"device is {device}, but torch finds no GPU here; use device=cpu")
-
-
-def _divisor(total: int, at_most: int) -> int:
-    """Return the largest divisor of ``total`` that is at most ``at_most``."""
-    return next(n for n in range(min(total, at_most), 0, -1) if total % n == 0)

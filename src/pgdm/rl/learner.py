@@ -206,11 +206,13 @@ def check_batch(cfg: PPOCfg, num_envs: int) -> None:
     Raises:
         ConfigError: with the sizes, if they do not.
     """
-    samples = num_envs * cfg.steps_per_env
-    if samples % cfg.minibatch_size:
+    samples, size = num_envs * cfg.steps_per_env, cfg.minibatch_size
+    if samples % size:
+        divisor = next(n for n in range(min(samples, size), 0, -1) if samples % n == 0)
         raise ConfigError(
-            f"minibatch_size {cfg.minibatch_size} does not divide the {samples} samples of an "
-            f"iteration (num_envs {num_envs} * steps_per_env {cfg.steps_per_env})"
+            f"algo.minibatch_size {size} does not divide the {samples} samples of an iteration "
+            f"(num_envs {num_envs} * algo.steps_per_env {cfg.steps_per_env}); choose a divisor "
+            f"such as {divisor}"
         )
 
 

@@ -15,8 +15,6 @@ from pgdm.tracking.mlflow import SYNCED, Mirror, Point, Store, Thin, find_run, p
 from pgdm.tracking.run_folder import FACTS, RunFolder, runs_root
 from pgdm.tracking.tracker import Tracker, TrackingCfg
 
-FINISH_S = 60.0
-"""How long the end of a run waits for MLflow at most."""
 RETRY_S = 30.0
 """Pause after a failure, before MLflow is tried again."""
 _POINTS_A_CALL = 20
@@ -43,8 +41,7 @@ class MlflowTracker(Tracker):
         self._earlier = self._folder.log.read()
         self._thin = Thin(self._folder.total_frames())
         self._points: deque[Point] = deque()
-        self._files: deque[tuple[Path, str]] = deque()
-        self._posters: deque[tuple[Path, int]] = deque()
+        self._videos: deque[tuple[Path, Path, int]] = deque()
         self._mirror: Mirror | None = None
         self._not_before, self._warned = 0.0, False
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="mlflow")
@@ -57,21 +54,15 @@ class MlflowTracker(Tracker):
             self._points.append((frames, int(1000 * time.time()), finite))
             self._send()
 
-    def artifact(self, path: Path, folder: str = "") -> None:
-        """Copy a file; one that is gone by then is left out."""
-        self._files.append((path, folder))
-        self._send()
-
     def video(self, path: Path, poster: Path, frames: int) -> None:
-        """Copy a film, and show its poster on the run's page."""
-        self._files.append((path, "videos"))
-        self._posters.append((poster, frames))
+        """Copy a film, and show its poster on the run's page; what is gone by then is left out."""
+        self._videos.append((path, poster, frames))
         self._send()
 
-    def finish(self, status: str) -> None:
+    def finish(self, status: str, patience_s: float = 60.0) -> None:
         """Send what is left, then the folder's files and the status."""
         last = self._pool.submit(self._end, status)
-        wait([last], FINISH_S)
+        wait([last], patience_s)
         self._pool.shutdown(wait=False, cancel_futures=True)
         if not last.done() or last.exception() is not None:
             _log.warning(
@@ -105,16 +96,13 @@ class MlflowTracker(Tracker):
             mirror.log(some)
             for _ in some:
                 self._points.popleft()
-        while self._files:
-            path, folder = self._files[0]
+        while self._videos:
+            path, poster, frames = self._videos[0]
             if path.exists():
-                mirror.artifact(path, folder)
-            self._files.popleft()
-        while self._posters:
-            poster, frames = self._posters[0]
+                mirror.artifact(path, "videos")
             if poster.exists():
                 mirror.poster(poster, frames)
-            self._posters.popleft()
+            self._videos.popleft()
         self._not_before = 0.0
 
     def _connected(self) -> Mirror:

@@ -32,17 +32,14 @@ class Tracker(ABC):
     def log(self, metrics: Mapping[str, float], frames: int) -> None:
         """Record metrics at a number of frames (environment steps, all simulations together)."""
 
-    def artifact(self, path: Path, folder: str = "") -> None:  # noqa: B027 (optional by design)
-        """Keep a copy of a file, in a folder of the run's artifacts."""
-
     def video(self, path: Path, poster: Path, frames: int) -> None:  # noqa: B027 (optional)
         """Keep an MP4 of the policy after ``frames`` and its poster picture."""
 
-    def finish(self, status: str) -> None:  # noqa: B027 (optional)
+    def finish(self, status: str, patience_s: float = 60.0) -> None:  # noqa: B027 (optional)
         """Close the record with status ``finished``, ``interrupted`` or ``failed``.
 
         Called once, last of all, when the run's folder is complete (``result.json`` written):
-        what of it is worth a copy is kept. Waits a bounded time for what is under way.
+        what of it is worth a copy is kept. Waits ``patience_s`` at most for what is under way.
         """
 
 

@@ -1,0 +1,26 @@
+"""What ``make run`` promises: the hammer is grasped, lifted and carried along its motion."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from command_line import process
+
+
+@pytest.mark.slow
+def test_the_quickstart_learns_to_swing_the_hammer(library_home: Path, tmp_path: Path) -> None:
+    outcome = process(
+        "pgdm-run", "+experiment=quickstart", "--offline", "run_dir=run", timeout_s=2400
+    )
+    assert outcome.code == 0, outcome.err
+    run = tmp_path / "run"
+    result = json.loads((run / "result.json").read_text())
+    reached = result["metrics"]
+    assert reached["eval_deterministic/lifted"] >= 0.95
+    assert reached["eval_deterministic/length"] == 85
+    assert reached["eval_deterministic/com_error"] <= 0.06  # m
+    assert reached["eval_deterministic/success"] >= 0.1
+    assert (run / result["video"]).stat().st_size > 10_000
