@@ -20,13 +20,13 @@ from command_line import TINY, command, process
 from pgdm.cli.errors import message
 from pgdm.cli.flags import read_flags
 from pgdm.cli.progress import ProgressView, duration
-from pgdm.cli.stop import StopRequest
 from pgdm.cli.summary import summary_table
 from pgdm.config.groups import available, groups
 from pgdm.config.store import compose
 from pgdm.errors import ConfigError
 from pgdm.experiment import RunResult
 from pgdm.rl.callback import Progress
+from pgdm.stop import StopRequest
 
 # The command line itself.
 

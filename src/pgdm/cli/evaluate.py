@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from pgdm.cli.stop import StopRequest
 from pgdm.cli.summary import metrics_table
 from pgdm.cli.train import notify
 from pgdm.config.saved import FILE, load_config
@@ -20,6 +19,7 @@ from pgdm.library import ensure
 from pgdm.rl.checkpoint import CheckpointFolder, read_checkpoint
 from pgdm.rl.evaluate import Evaluator, load_policy
 from pgdm.rl.networks import ActorCritic
+from pgdm.stop import StopRequest
 
 
 @dataclass(frozen=True)

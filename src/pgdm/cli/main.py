@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from pgdm.cli import assets, dashboard, runs
+from pgdm.cli import assets, dashboard, runs, sweep
 from pgdm.cli.errors import USAGE, check_environment, guarded, report
 from pgdm.errors import ConfigError
 
@@ -26,6 +26,7 @@ app = typer.Typer(
 )
 app.add_typer(assets.app, name="assets")
 app.add_typer(runs.app, name="runs")
+app.add_typer(sweep.app, name="sweep")
 app.command("dashboard")(dashboard.dashboard)
 
 

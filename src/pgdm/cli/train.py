@@ -8,10 +8,10 @@ from rich.console import Console
 
 from pgdm.cli.errors import report
 from pgdm.cli.progress import ProgressView
-from pgdm.cli.stop import StopRequest
 from pgdm.cli.summary import summary_table
 from pgdm.config.schema import ExperimentCfg
 from pgdm.experiment import RunResult, run_experiment
+from pgdm.stop import StopRequest
 
 _PROGRESS = Console(stderr=True)
 

@@ -36,7 +36,7 @@ class MlflowTracker(Tracker):
 
     def __init__(self, cfg: TrackingCfg, folder: RunFolder, facts: Mapping[str, Any]) -> None:
         self._cfg, self._folder = cfg, folder
-        self._uri = cfg.uri or store_uri(runs_root(folder.path))
+        self._uri = cfg.uri or folder.parent().get("uri") or store_uri(runs_root(folder.path))
         self._facts = {name: facts[name] for name in FACTS if facts.get(name) is not None}
         self._earlier = self._folder.log.read()
         self._thin = Thin(self._folder.total_frames())

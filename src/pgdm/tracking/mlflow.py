@@ -173,8 +173,12 @@ class Mirror:
         self._store, self._client, self._folder = store, store.client, folder
         if run is None:
             start_ms = int(1000 * folder.started())
+            # Named at once: who is killed before the link is written finds it by its folder.
             run = self._client.create_run(
-                store.experiment_id, start_time=start_ms, run_name=folder.name()
+                store.experiment_id,
+                start_time=start_ms,
+                run_name=folder.name(),
+                tags={"run_dir": str(folder.path)},
             )
         self.run_id = run.info.run_id
         self._params = dict(run.data.params)
@@ -198,6 +202,8 @@ class Mirror:
         texts = {**self._folder.tags(), **tags, **changed}
         texts["mlflow.note.content"] = f"`{self._folder.path}`\n\n{metric_names.markdown()}"
         texts["mlflow.source.name"] = "pgdm-run"
+        if parent := self._folder.parent().get("run_id"):
+            texts["mlflow.parentRunId"] = parent
         if "git" in texts:
             texts["mlflow.source.git.commit"] = texts["git"].rstrip("+")
         all_tags = [RunTag(name, text) for name, text in texts.items()]

@@ -20,6 +20,8 @@ from pgdm.errors import RunError
 from pgdm.tracking.run_log import FILE_NAME, RunLog
 
 CONFIG, RESULT, LINK = "config.yaml", "result.json", "mlflow.json"
+PARENT = "parent"
+"""Key in ``mlflow.json``: the MLflow run that this one is shown under, and its store."""
 ARTIFACTS = "mlflow-artifacts"
 """Folder beside ``mlflow.db`` with MLflow's copies of files."""
 STATUSES = ("running", "finished", "interrupted", "failed")
@@ -84,6 +86,11 @@ class RunFolder:
         """Which MLflow run mirrors this one; empty if none does."""
         return read_json(self.path / LINK)
 
+    def parent(self) -> dict[str, str]:
+        """Return ``run_id`` and ``uri`` of the MLflow run that this one belongs to, or nothing."""
+        parent = self.link.get(PARENT)
+        return parent if isinstance(parent, dict) else {}
+
     def setting(self, key: str) -> Any:
         """Return a setting by its dotted key, or None if there is none."""
         value: Any = self.config
@@ -115,6 +122,11 @@ class RunFolder:
             return status if status in STATUSES else "failed"
         silent = locked is False or time.time() - self.modified() > SILENT_S
         return "interrupted" if silent else "running"
+
+    @property
+    def busy(self) -> bool:
+        """Whether a process works in the folder, as far as its lock tells."""
+        return self._locked() is True
 
     def _locked(self) -> bool | None:
         """Return whether a process works in the folder; None if that cannot be told."""

@@ -87,7 +87,7 @@ class RunLog:
             kept[key] = record
         return list(kept.values())
 
-    def tail(self) -> list[Record]:
+    def tail(self, size_bytes: int = _TAIL_BYTES) -> list[Record]:
         """Return the last whole lines, as many as a short look at the file's end gives.
 
         Raises:
@@ -96,13 +96,13 @@ class RunLog:
         try:
             with open(self.path, "rb") as file:
                 size = file.seek(0, os.SEEK_END)
-                file.seek(max(0, size - _TAIL_BYTES))
+                file.seek(max(0, size - size_bytes))
                 lines = file.read().split(b"\n")[:-1]
         except FileNotFoundError:
             return []
         except OSError as error:
             raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
-        whole = lines if size <= _TAIL_BYTES else lines[1:]
+        whole = lines if size <= size_bytes else lines[1:]
         return [record for line in whole if (record := _parse(line))]
 
     def truncate(self, frames: int) -> int:

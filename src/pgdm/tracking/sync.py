@@ -51,7 +51,7 @@ def sync(
             key = (str(place), str(folder.setting("tracking.experiment") or EXPERIMENT))
             if key not in stores:
                 stores[key] = Store.open(*key)
-            outcome = _sync_run(stores[key], folder)
+            outcome = sync_run(stores[key], folder)
         except RunError as error:
             outcome = Synced(folder, "unreadable", str(error))
         except (MlflowException, OSError) as error:
@@ -62,7 +62,8 @@ def sync(
     return done
 
 
-def _sync_run(store: Store, folder: RunFolder) -> Synced:
+def sync_run(store: Store, folder: RunFolder) -> Synced:
+    """Make MLflow show one run as its own records do."""
     run = find_run(store, folder)
     status = folder.status()
     if run is not None and status == "running":

@@ -50,8 +50,7 @@ class StopRequest:
             raise KeyboardInterrupt
         self.signal = number
         how = "Ctrl-C" if number == signal.SIGINT else "SIGTERM"
-        print(
-            f"\n{how}: saving and stopping at the next safe point (again: stop at once)",
-            file=sys.stderr,
-            flush=True,
+        sys.stderr.write(
+            f"\n{how}: saving and stopping at the next safe point (again: stop at once)\n"
         )
+        sys.stderr.flush()

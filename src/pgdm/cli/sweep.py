@@ -1,0 +1,237 @@
+"""``pgdm sweep``: sweeps that run or have ended, from any shell."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pgdm.errors import SweepError, UnknownNameError
+from pgdm.sweep.ledger import (
+    CANCELLED,
+    FAILED,
+    FILE,
+    FINISHED,
+    INTERRUPTED,
+    RUNNING,
+    WAITING,
+    Entry,
+    Ledger,
+)
+from pgdm.sweep.mlflow import SweepMirror
+from pgdm.sweep.state import NAME, SLOTS, Row, log_path, parent, rows, settle, summarize
+from pgdm.sweep.view import SweepView, failures, percent, span, summary_line
+
+_COLOURS = {
+    RUNNING: "cyan",
+    FINISHED: "green",
+    FAILED: "red",
+    INTERRUPTED: "yellow",
+    CANCELLED: "magenta",
+}
+_PLAN = "plan.json"  # pgdm.sweep.plan knows it too, and loads torch
+_WIDE = 200  # columns where nobody's terminal sets them
+_POLL_S = 0.5
+_STOP_S = 120.0
+
+app = typer.Typer(help="Look after a sweep: see it, end it, go on with it.", no_args_is_help=True)
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the sweep.")]
+Jobs = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[JOB]...", help="Jobs, by a part of their name or by their key."),
+]
+Detach = Annotated[bool, typer.Option("--detach", help="Go on in the background.")]
+
+
+@app.command()
+def status(
+    folder: Folder,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
+) -> None:
+    """Show each job: state, frames, success, attempts, time left; and all of it in one line."""
+    ledger = _settled(folder)
+    found = rows(ledger)
+    summary = summarize(found, ledger.fact(SLOTS) or 1)
+    if as_json:
+        whole = {"name": ledger.fact(NAME), "driven": parent(ledger) is not None}
+        jobs = [dataclasses.asdict(row) for row in found]
+        print(json.dumps({**whole, **dataclasses.asdict(summary), "jobs": jobs}, default=str))
+        return
+    console = Console() if sys.stdout.isatty() else Console(width=_WIDE)
+    console.print(_table(found))
+    print(summary_line(ledger.fact(NAME) or folder.name, summary))
+    if parent(ledger) is None and any(row.state in (WAITING, INTERRUPTED) for row in found):
+        print(f"nobody works on it; pgdm sweep resume {folder} goes on")
+
+
+@app.command()
+def watch(folder: Folder) -> None:
+    """Follow a sweep until it ends; Ctrl-C only ends the watching."""
+    ledger = _settled(folder)
+    with SweepView(ledger.fact(NAME) or folder.name, ledger) as view:
+        while parent(ledger) is not None:
+            view.update()
+            time.sleep(_POLL_S)
+    settle(ledger)
+    print(view.line())
+    if text := failures(rows(ledger)):
+        print(text)
+    raise typer.Exit(int(any(state != FINISHED for state in ledger.states().values())))
+
+
+@app.command()
+def logs(
+    folder: Folder,
+    job: Annotated[str, typer.Argument(metavar="JOB", help="A part of its name, or its key.")],
+    follow: Annotated[bool, typer.Option("-f", "--follow", help="Go on until it ends.")] = False,
+) -> None:
+    """Print what a job's last attempt printed."""
+    ledger = _settled(folder)
+    entry = _one(ledger.entries(), job)
+    if entry.last is None:
+        raise SweepError(f"{entry.name} has not been started yet")
+    path = log_path(ledger.folder, entry.name, entry.last.number)
+    with open(path, errors="replace") as log:
+        while True:
+            # Asked before reading: what it wrote last is then there.
+            goes_on = follow and any(
+                r.key == entry.key and r.state == RUNNING for r in rows(ledger)
+            )
+            while text := log.read(1 << 16):
+                print(text, end="", flush=True)
+            if not goes_on:
+                return
+            time.sleep(_POLL_S)
+
+
+@app.command()
+def cancel(folder: Folder, jobs: Jobs = None) -> None:
+    """Stop jobs, or all that are not finished: running ones save what they have reached."""
+    ledger = _settled(folder)
+    ended = (FINISHED, FAILED) if not jobs else (FINISHED,)
+    chosen = [entry for entry in _chosen(ledger, jobs) if entry.state not in ended]
+    keys = {entry.key for entry in chosen}
+    ledger.set_states(dict.fromkeys(keys, CANCELLED))
+    if parent(ledger) is None:
+        for entry in chosen:
+            if entry.last is not None and entry.last.state == RUNNING:
+                entry.last.process.signal(signal.SIGTERM)
+    limit = time.monotonic() + _STOP_S
+    while any(row.state == RUNNING and row.key in keys for row in rows(ledger)):
+        if time.monotonic() > limit:
+            raise SweepError(f"not all have stopped yet; see pgdm sweep status {folder}")
+        time.sleep(_POLL_S)
+    print(f"cancelled {len(chosen)} jobs; pgdm sweep resume {folder} would go on with them")
+
+
+@app.command()
+def retry(folder: Folder, jobs: Jobs = None) -> None:
+    """Try failed jobs again, or the named ones: here, or by who drives the sweep now."""
+    ledger = _settled(folder)
+    wanted = _chosen(ledger, jobs)
+    chosen = [e for e in wanted if e.state == FAILED or (jobs and e.state != FINISHED)]
+    chosen = [e for e in chosen if e.state != RUNNING]
+    if not chosen:
+        print("no failed jobs" if not jobs else "nothing to try again: finished or running")
+        return
+    if parent(ledger) is not None:
+        ledger.set_states({entry.key: WAITING for entry in chosen})
+        print(f"{len(chosen)} jobs will be tried again by the sweep that runs")
+        return
+    raise typer.Exit(_go_on(folder, keys={entry.key for entry in chosen}))
+
+
+@app.command()
+def resume(folder: Folder, detach: Detach = False) -> None:
+    """Go on with all that is not finished, as the sweep was started; needs no other settings."""
+    _settled(folder)
+    raise typer.Exit(_go_on(folder, detach=detach))
+
+
+def _go_on(folder: Path, detach: bool = False, keys: set[str] | None = None) -> int:
+    from pgdm.cli.train import notify
+    from pgdm.sweep.local import launched, run_sweep
+    from pgdm.sweep.plan import read_plan
+
+    plan = read_plan(folder)
+    if keys is not None:
+        jobs = tuple(job for job in plan.jobs if job.key in keys)
+        plan = dataclasses.replace(plan, jobs=jobs)
+    sweep, launcher = launched(plan)
+    return run_sweep(plan, dataclasses.replace(sweep, detach=detach), launcher, notify)
+
+
+def _settled(folder: Path) -> Ledger:
+    """Return a sweep's ledger, brought to the truth, and MLflow with it."""
+    if not (folder / _PLAN).exists():
+        raise SweepError(f"'{folder}' holds no sweep: it has no {_PLAN}")
+    missing = not (folder / FILE).exists()
+    ledger = Ledger(folder)
+    if missing:
+        from pgdm.sweep.driver import recall
+        from pgdm.sweep.plan import read_plan
+
+        recall(ledger, read_plan(folder))
+    if parent(ledger) is not None:
+        return ledger  # it sees to all that itself
+    closed = settle(ledger)
+    mirror = SweepMirror.left_running(ledger.folder, lambda text: print(text, file=sys.stderr))
+    if mirror is not None:
+        for entry in closed:
+            mirror.correct(entry.run_dir)
+        whole = all(state == FINISHED for state in ledger.states().values())
+        mirror.close(FINISHED if whole else INTERRUPTED)
+    return ledger
+
+
+def _chosen(ledger: Ledger, jobs: Sequence[str] | None) -> list[Entry]:
+    """Return the jobs that are meant; all if none is named.
+
+    Raises:
+        UnknownNameError: if a text is in no job's name.
+        SweepError: if it is in several.
+    """
+    entries = ledger.entries()
+    return entries if not jobs else [_one(entries, text) for text in jobs]
+
+
+def _one(entries: Sequence[Entry], text: str) -> Entry:
+    exact = [entry for entry in entries if text in (entry.name, entry.key)]
+    found = exact or [e for e in entries if text in e.name or e.key.startswith(text)]
+    if not found:
+        raise UnknownNameError("job", text, [entry.name for entry in entries])
+    if len(found) > 1:
+        some = ", ".join(entry.name for entry in found[:3])
+        raise SweepError(f"'{text}' is in the names of {len(found)} jobs: {some}; write more of it")
+    return found[0]
+
+
+def _table(found: Sequence[Row]) -> Table:
+    table = Table(box=None, header_style="bold")
+    table.add_column("job", overflow="fold")
+    table.add_column("state")
+    for head in ("frames", "success", "attempts", "left"):
+        table.add_column(head, justify="right")
+    table.add_column("error", overflow="fold")
+    for row in found:
+        table.add_row(
+            escape(row.name),
+            f"[{_COLOURS.get(row.state, 'default')}]{row.state}[/]",
+            f"{row.frames:,}/{row.total_frames:,}",
+            percent(row.success),
+            str(row.attempts),
+            "-" if row.left_s is None else span(row.left_s),
+            escape(row.error or ""),
+        )
+    return table

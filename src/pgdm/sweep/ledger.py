@@ -1,0 +1,272 @@
+"""What a sweep did: every attempt at every job, in an SQLite file in the sweep's folder.
+
+Any number of processes read and write it, and any of them may be killed at any moment. What a job
+has reached is told by its run folder; a ledger that is lost is made again from there.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pgdm.errors import SweepError
+from pgdm.sweep.processes import Process
+
+if TYPE_CHECKING:
+    from pgdm.sweep.plan import Plan
+
+FILE = "ledger.sqlite"
+WAITING, RUNNING, FINISHED = "waiting", "running", "finished"
+FAILED, INTERRUPTED, CANCELLED = "failed", "interrupted", "cancelled"
+STATES = (WAITING, RUNNING, FINISHED, FAILED, INTERRUPTED, CANCELLED)
+"""Of a job; of an attempt: running, finished, failed or interrupted."""
+LOCK_S = 120.0
+"""How long a locked ledger is tried again."""
+
+# A rollback journal and not a write-ahead log, which needs memory that all writers share.
+_SCHEMA = """
+BEGIN IMMEDIATE;
+CREATE TABLE IF NOT EXISTS jobs (
+    key TEXT PRIMARY KEY, place INTEGER, name TEXT, run_dir TEXT, total_frames INTEGER, state TEXT);
+CREATE TABLE IF NOT EXISTS attempts (
+    key TEXT, number INTEGER, state TEXT, host TEXT, pid INTEGER, born TEXT, start REAL, end REAL,
+    exit_code INTEGER, frames INTEGER, metrics TEXT, error TEXT, PRIMARY KEY (key, number));
+CREATE TABLE IF NOT EXISTS facts (name TEXT PRIMARY KEY, value TEXT);
+COMMIT;
+"""
+_RETRY_S = 0.05
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One process that worked on a job."""
+
+    key: str
+    number: int
+    """Counts from 1."""
+    state: str
+    process: Process
+    start: float
+    """s since the epoch."""
+    end: float | None = None
+    exit_code: int | None = None
+    frames: int | None = None
+    """How far the run was at the end, environment steps."""
+    metrics: Mapping[str, float] | None = None
+    """Its last evaluation."""
+    error: str | None = None
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A job, and the last attempt at it."""
+
+    key: str
+    name: str
+    run_dir: Path
+    total_frames: int
+    state: str
+    last: Attempt | None
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How an attempt ended."""
+
+    state: str
+    exit_code: int | None
+    frames: int | None
+    metrics: Mapping[str, float]
+    error: str | None
+
+
+class Ledger:
+    """The ledger of the sweep in a folder; the file is made if it is missing.
+
+    Each method is one transaction: it is done whole or not at all. A ledger that is locked is
+    tried again for ``LOCK_S``.
+
+    Args:
+        folder: of the sweep.
+
+    Raises:
+        SweepError: from every method, if the file cannot be read or written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.absolute()
+        self.path = self.folder / FILE
+        self._do(lambda db: db.executescript(_SCHEMA) if _is_empty(db) else None)
+
+    def add(self, plan: Plan) -> None:
+        """Note a plan's jobs; those that are known keep their state and attempts."""
+        rows = [
+            (job.key, place, job.name, self._shown(Path(job.cfg.run_dir)), job.cfg.total_frames)
+            for place, job in enumerate(plan.jobs)
+        ]
+        self._write(
+            "INSERT INTO jobs VALUES (?, ?, ?, ?, ?, 'waiting') ON CONFLICT (key) DO UPDATE SET "
+            "name = excluded.name, run_dir = excluded.run_dir, "
+            "total_frames = excluded.total_frames",
+            rows,
+        )
+
+    def entries(self) -> list[Entry]:
+        """Return all jobs in the order of the plan."""
+        last = {attempt.key: attempt for attempt in self.attempts()}
+        rows = self._read("SELECT key, name, run_dir, total_frames, state FROM jobs ORDER BY place")
+        return [
+            Entry(key, name, self.folder / run_dir, total, state, last.get(key))
+            for key, name, run_dir, total, state in rows
+        ]
+
+    def states(self) -> dict[str, str]:
+        """Return the state of each job by its key."""
+        return dict(self._read("SELECT key, state FROM jobs"))
+
+    def attempts(self) -> list[Attempt]:
+        """Return all attempts in order."""
+        return [_attempt(row) for row in self._read("SELECT * FROM attempts ORDER BY key, number")]
+
+    def begin(self, key: str, process: Process) -> int:
+        """Note that an attempt begins, and return its number."""
+        self._write(
+            "INSERT INTO attempts (key, number, state, host, pid, born, start) "
+            "SELECT ?1, coalesce(max(number), 0) + 1, 'running', ?2, ?3, ?4, ?5 "
+            "FROM attempts WHERE key = ?1",
+            [(key, process.host, process.pid, process.born, time.time())],
+            ("UPDATE jobs SET state = 'running' WHERE key = ?", (key,)),
+        )
+        ((number,),) = self._read("SELECT max(number) FROM attempts WHERE key = ?", (key,))
+        return number
+
+    def register(self, key: str, number: int, process: Process) -> bool:
+        """Note which process works on an attempt; false if it has been given up meanwhile."""
+        changed = self._write(
+            "UPDATE attempts SET host = ?, pid = ?, born = ? "
+            "WHERE key = ? AND number = ? AND state = 'running'",
+            [(process.host, process.pid, process.born, key, number)],
+        )
+        return changed == 1
+
+    def end(self, key: str, number: int, ending: Ending) -> None:
+        """Note how an attempt ended; what was noted before stays."""
+        self._write(
+            "UPDATE attempts SET state = ?, end = ?, exit_code = ?, frames = ?, metrics = ?, "
+            "error = ? WHERE key = ? AND number = ? AND state = 'running'",
+            [
+                (
+                    ending.state,
+                    time.time(),
+                    ending.exit_code,
+                    ending.frames,
+                    json.dumps(ending.metrics),
+                    ending.error,
+                    key,
+                    number,
+                )
+            ],
+        )
+
+    def recall(self, key: str, start: float, end: float, ending: Ending) -> None:
+        """Note a past attempt that only the run folder tells of."""
+        row = (key, ending.state, start, end, ending.frames, json.dumps(ending.metrics))
+        self._write(
+            "INSERT OR IGNORE INTO attempts (key, number, state, host, pid, born, start, end, "
+            "frames, metrics) VALUES (?, 1, ?, '', 0, '', ?, ?, ?, ?)",
+            [row],
+        )
+
+    def set_states(self, states: Mapping[str, str]) -> None:
+        """Change the state of jobs."""
+        rows = [(state, key) for key, state in states.items()]
+        self._write("UPDATE jobs SET state = ? WHERE key = ?", rows)
+
+    def fact(self, name: str) -> Any:
+        """Return something that is known of the sweep as a whole, or None."""
+        rows = self._read("SELECT value FROM facts WHERE name = ?", (name,))
+        return json.loads(rows[0][0]) if rows else None
+
+    def set_fact(self, name: str, value: Any) -> None:
+        """Note something about the sweep as a whole."""
+        self._write("INSERT OR REPLACE INTO facts VALUES (?, ?)", [(name, json.dumps(value))])
+
+    def _shown(self, run_dir: Path) -> str:
+        """Return a run's folder as the ledger names it, so that a sweep may be moved as a whole."""
+        inside = run_dir.is_relative_to(self.folder)
+        return str(run_dir.relative_to(self.folder) if inside else run_dir)
+
+    def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+        return self._do(lambda db: db.execute(query, values).fetchall())
+
+    def _write(
+        self,
+        query: str,
+        rows: Iterable[tuple[Any, ...]],
+        then: tuple[str, tuple[Any, ...]] | None = None,
+    ) -> int:
+        """Do a query for each row, then another one, all or nothing; return the rows changed."""
+        wanted = list(rows)
+
+        def work(db: sqlite3.Connection) -> int:
+            db.execute("BEGIN IMMEDIATE")
+            changed = db.executemany(query, wanted).rowcount
+            if then is not None:
+                db.execute(*then)
+            db.execute("COMMIT")
+            return changed
+
+        return self._do(work)
+
+    def _do(self, work: Callable[[sqlite3.Connection], T]) -> T:
+        """Do work on a connection of its own: nothing is held open, and nothing left half done."""
+        limit = time.monotonic() + LOCK_S
+        while True:
+            try:
+                with closing(_connect(self.path)) as db:
+                    return work(db)
+            except sqlite3.Error as error:
+                if "locked" not in str(error):
+                    raise SweepError(_explained(self.path, error)) from error
+                if time.monotonic() > limit:
+                    raise SweepError(
+                        f"{self.path} has been locked by another program for {LOCK_S:.0f} s; end "
+                        "that program, then start the same command again: nothing is lost"
+                    ) from error
+            time.sleep(_RETRY_S)
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    # Short waits inside SQLite, so that a second Ctrl-C gets through.
+    return sqlite3.connect(path, timeout=0.5, isolation_level=None)
+
+
+def _is_empty(db: sqlite3.Connection) -> bool:
+    return db.execute("SELECT count(*) FROM sqlite_master").fetchone() == (0,)
+
+
+def _explained(path: Path, error: sqlite3.Error) -> str:
+    text = str(error)
+    if "full" in text or "disk I/O" in text:
+        return (
+            f"cannot write {path}: {text}; make room and start the same command again: what the "
+            "jobs have reached is in their run folders"
+        )
+    if isinstance(error, sqlite3.OperationalError):
+        return f"cannot use {path}: {text}; check that its folder exists and may be written"
+    return f"{path} is damaged ({text}); remove it: it is made again from the run folders"
+
+
+def _attempt(row: tuple[Any, ...]) -> Attempt:
+    key, number, state, host, pid, born, start, end, code, frames, metrics, error = row
+    known = json.loads(metrics) if metrics else None
+    process = Process(host, pid, born)
+    return Attempt(key, number, state, process, start, end, code, frames, known, error)

@@ -1,0 +1,84 @@
+"""A sweep as MLflow shows it: one run, and its jobs below it. MLflow never stops a sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pgdm.errors import TrackingError
+from pgdm.sweep.ledger import RUNNING
+from pgdm.tracking.run_folder import LINK, read_json
+
+if TYPE_CHECKING:
+    from pgdm.sweep.plan import Job, Plan
+    from pgdm.tracking.group import Group
+
+Notify = Callable[[str], None]
+
+
+class SweepMirror:
+    """Tells MLflow of a sweep; what fails there is told once, and the sweep goes on.
+
+    Args:
+        group: the sweep's run; None tells nobody.
+        notify: told in a sentence if MLflow fails.
+    """
+
+    def __init__(self, group: Group | None, notify: Notify) -> None:
+        self._group, self._notify = group, notify
+
+    @classmethod
+    def of(cls, plan: Plan, notify: Notify) -> SweepMirror:
+        """Return the mirror of a plan: where its first job goes that has one."""
+        chosen = next((j.cfg.tracking for j in plan.jobs if j.cfg.tracking.kind == "mlflow"), None)
+        if chosen is None:
+            return cls(None, notify)
+        from pgdm.tracking.group import Group
+        from pgdm.tracking.mlflow import sqlite_file, store_uri
+        from pgdm.tracking.run_folder import runs_root
+
+        known = read_json(plan.folder / LINK).get("uri", "")
+        file = sqlite_file(known)
+        stays = known and (file is None or file.exists())
+        uri = chosen.uri or (known if stays else store_uri(runs_root(plan.folder)))
+        return cls(Group(plan.folder, uri, chosen.experiment), notify)
+
+    @classmethod
+    def left_running(cls, folder: Path, notify: Notify) -> SweepMirror | None:
+        """Return the mirror of a sweep that MLflow still holds to be running, or None."""
+        link = read_json(folder / LINK)
+        if link.get("status") != RUNNING:
+            return None
+        from pgdm.tracking.group import Group
+
+        return cls(Group(folder, link["uri"], link["experiment"]), notify)
+
+    def open(self, plan: Plan) -> None:
+        """Make what MLflow needs, before any job starts."""
+        self._tell(lambda group: group.open(plan.name, {"command": plan.command}))
+        for job in plan.jobs:
+            if Path(job.cfg.run_dir).exists():
+                self.adopt(job)
+
+    def adopt(self, job: Job) -> None:
+        """Have a job shown under its sweep, if it goes to MLflow."""
+        if job.cfg.tracking.kind == "mlflow":
+            self._tell(lambda group: group.adopt(Path(job.cfg.run_dir)))
+
+    def correct(self, run_dir: Path) -> None:
+        """Give a run that was killed its true status."""
+        self._tell(lambda group: group.correct(run_dir))
+
+    def close(self, status: str) -> None:
+        """Tell how the sweep ended."""
+        self._tell(lambda group: group.close(status))
+
+    def _tell(self, what: Callable[[Group], None]) -> None:
+        if self._group is None:
+            return
+        try:
+            what(self._group)
+        except TrackingError as error:
+            self._group = None
+            self._notify(f"{error}; the sweep goes on, `pgdm runs sync` fills in what is missing")

@@ -1,0 +1,202 @@
+"""Where the jobs of a sweep stand: from the ledger, and from the run folders, the truth."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pgdm.sweep.ledger import (
+    FAILED,
+    FINISHED,
+    INTERRUPTED,
+    RUNNING,
+    STATES,
+    WAITING,
+    Attempt,
+    Ending,
+    Entry,
+    Ledger,
+)
+from pgdm.sweep.processes import Process
+from pgdm.tracking.run_folder import RunFolder
+from pgdm.tracking.run_log import Record, metrics_of
+
+SUCCESS = "eval_sampled/success"
+NAME, PARENT, SLOTS = "name", "parent", "slots"
+"""Facts in the ledger: the sweep's name, the process that drives it, and its jobs at a time."""
+LOGS = "logs"
+_TAIL_BYTES = 1 << 14  # a dozen lines
+_LEFT = (WAITING, RUNNING, INTERRUPTED)
+
+
+@dataclass(frozen=True)
+class Row:
+    """What people see of a job."""
+
+    key: str
+    name: str
+    state: str
+    """True now: ``running`` only if its process lives."""
+    attempts: int
+    frames: int
+    total_frames: int
+    success: float | None
+    """Of the last evaluation, 0..1."""
+    steps_per_s: float | None
+    """Of the last iteration, while it runs."""
+    frames_per_s: float | None
+    """Over the whole run, evaluations included."""
+    left_s: float | None
+    """Time that the rest takes at that pace, while it runs."""
+    run_dir: Path
+    log: Path | None
+    """Output of the last attempt."""
+    error: str | None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A sweep as a whole."""
+
+    counts: dict[str, int]
+    """Jobs by state; states without any are left out."""
+    frames: int
+    total_frames: int
+    left_s: float | None
+    """Time until all is done, if it goes on as it does; None if that cannot be told."""
+
+
+def stand(run_dir: Path, total_frames: int) -> Ending:
+    """Return how far a run is by what its folder tells; what was killed counts as interrupted."""
+    folder = RunFolder(run_dir)
+    result = folder.result
+    frames, metrics = result.get("frames"), result.get("metrics")
+    if not isinstance(frames, int) or not isinstance(metrics, dict):
+        lines = folder.log.tail()
+        frames, metrics = (int(lines[-1]["frames"]) if lines else 0), _evaluation(lines)
+    status = result.get("status", INTERRUPTED)
+    if status == FINISHED and frames < total_frames:
+        status = INTERRUPTED  # the end of a shorter run
+    state = status if status in (FINISHED, FAILED) else INTERRUPTED
+    return Ending(state, None, frames, metrics, result.get("error"))
+
+
+def works(attempt: Attempt, run_dir: Path) -> bool:
+    """Return whether an attempt's process is at work, as far as that can be told from here."""
+    if attempt.state != RUNNING:
+        return False
+    return attempt.process.alive or (
+        not attempt.process.here and RunFolder(run_dir).status() == RUNNING
+    )
+
+
+def parent(ledger: Ledger) -> Process | None:
+    """Return the process that drives the sweep now, or None; only this machine's are known."""
+    known = ledger.fact(PARENT)
+    process = Process(*known) if known else None
+    return process if process is not None and process.alive else None
+
+
+def settle(ledger: Ledger) -> list[Entry]:
+    """Close the attempts whose process is gone, and return their jobs as they were before."""
+    closed = []
+    for entry in ledger.entries():
+        last = entry.last
+        if last is None or last.state != RUNNING or works(last, entry.run_dir):
+            continue
+        ending = stand(entry.run_dir, entry.total_frames)
+        ledger.end(entry.key, last.number, ending)
+        if entry.state == RUNNING or ending.state == FINISHED:
+            ledger.set_states({entry.key: ending.state})
+        closed.append(entry)
+    return closed
+
+
+def rows(ledger: Ledger) -> list[Row]:
+    """Return all jobs of a sweep in the order of its plan."""
+    return [_row(ledger.folder, entry) for entry in ledger.entries()]
+
+
+def summarize(found: Sequence[Row], slots: int) -> Summary:
+    """Return a sweep as a whole.
+
+    Args:
+        found: its jobs.
+        slots: how many of them run at a time.
+    """
+    counted = Counter(row.state for row in found)
+    rates = [row.frames_per_s for row in found if row.frames_per_s]
+    remaining = [row.total_frames - row.frames for row in found if row.state in _LEFT]
+    left_s = 0.0 if not remaining else None
+    if remaining and rates:
+        rate = sum(rates) / len(rates)
+        # The longest job cannot be shared out.
+        left_s = max(sum(remaining) / min(max(slots, 1), len(remaining)), max(remaining)) / rate
+    return Summary(
+        {state: counted[state] for state in STATES if counted[state]},
+        sum(min(row.frames, row.total_frames) for row in found),
+        sum(row.total_frames for row in found),
+        left_s,
+    )
+
+
+def log_path(folder: Path, name: str, attempt: int) -> Path:
+    """Return the file with the output of an attempt at a job."""
+    safe = "".join(c if c.isalnum() or c in "=.,+-" else "_" for c in name)
+    return folder / LOGS / f"{safe[:150]}.{attempt}.log"
+
+
+def _row(folder: Path, entry: Entry) -> Row:
+    last, state = entry.last, entry.state
+    ending = None if last is None else Ending(last.state, None, last.frames, last.metrics or {}, "")
+    lines: list[Record] = []
+    if last is not None and last.state == RUNNING:
+        if works(last, entry.run_dir):
+            lines = RunFolder(entry.run_dir).log.tail(_TAIL_BYTES)
+            # Evaluations lie far apart; an iteration's episodes are drawn in the same way.
+            shown = {SUCCESS: _last(lines, "train/success")}
+            ending = Ending(RUNNING, None, _last(lines, "frames"), shown, None)
+        else:
+            ending = stand(entry.run_dir, entry.total_frames)
+        state = ending.state if state == RUNNING or ending.state in (RUNNING, FINISHED) else state
+    frames = (ending.frames if ending else None) or 0
+    pace = _pace(last, lines, frames)
+    remaining = max(entry.total_frames - frames, 0)
+    return Row(
+        key=entry.key,
+        name=entry.name,
+        state=state,
+        attempts=0 if last is None else last.number,
+        frames=frames,
+        total_frames=entry.total_frames,
+        success=ending.metrics.get(SUCCESS) if ending else None,
+        steps_per_s=_last(lines, "train/steps_per_s"),
+        frames_per_s=pace,
+        left_s=remaining / pace if pace and state == RUNNING else None,
+        run_dir=entry.run_dir,
+        log=None if last is None else log_path(folder, entry.name, last.number),
+        error=None if last is None or state == FINISHED else last.error,
+    )
+
+
+def _pace(last: Attempt | None, lines: Sequence[Record], frames: int) -> float | None:
+    elapsed_s = _last(lines, "time_s")
+    if elapsed_s is None and last is not None and last.state == FINISHED and last.number == 1:
+        elapsed_s = (last.end or time.time()) - last.start
+    return frames / elapsed_s if elapsed_s and frames else None
+
+
+def _last(lines: Sequence[Record], name: str) -> Any:
+    """Return the last value of a metric that was recorded, or None."""
+    values = (line[name] for line in reversed(lines) if name in line)
+    return next((v for v in values if isinstance(v, int | float) and math.isfinite(v)), None)
+
+
+def _evaluation(lines: Sequence[Record]) -> dict[str, float]:
+    found = (metrics_of(line) for line in reversed(lines) if line["kind"] == "eval")
+    return next(found, {})

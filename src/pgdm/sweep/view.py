@@ -1,0 +1,144 @@
+"""A sweep as people watch it: a live table on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from types import TracebackType
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.markup import escape
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+
+from pgdm.sweep.ledger import FAILED, FINISHED, RUNNING, WAITING, Ledger
+from pgdm.sweep.state import SLOTS, Row, Summary, rows, summarize
+
+PLAIN_INTERVAL_S = 30.0
+"""Time between two plain lines."""
+_REFRESH_S = 1.0
+_TAIL_LINES = 15
+_UNKNOWN = "-"
+
+
+class SweepView:
+    """Shows what runs and how far all of it is; a context.
+
+    Args:
+        name: of the sweep.
+        ledger: what it did.
+    """
+
+    def __init__(self, name: str, ledger: Ledger) -> None:
+        self._name, self._ledger = name, ledger
+        self._console = Console(stderr=True)
+        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._shown_s = self._printed_s = -math.inf
+        self._states: dict[str, str] = {}
+
+    def __enter__(self) -> SweepView:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._live.stop()
+
+    def update(self) -> None:
+        """Show how it stands now, if that has not just been done."""
+        now = time.monotonic()
+        if now - self._shown_s < _REFRESH_S:
+            return
+        self._shown_s = now
+        found = rows(self._ledger)
+        summary = summarize(found, self._ledger.fact(SLOTS) or 1)
+        if self._console.is_terminal:
+            self._live.update(_table(self._name, found, summary), refresh=True)
+            return
+        for row in found:
+            if self._states.get(row.key, WAITING) != row.state:
+                self._print(_change(row))
+        self._states = {row.key: row.state for row in found}
+        if now - self._printed_s >= PLAIN_INTERVAL_S:
+            self._printed_s = now
+            self._print(summary_line(self._name, summary))
+
+    def line(self) -> str:
+        """Return how it stands now, in one line."""
+        found = rows(self._ledger)
+        return summary_line(self._name, summarize(found, self._ledger.fact(SLOTS) or 1))
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def summary_line(name: str, summary: Summary) -> str:
+    """Return a sweep in one line."""
+    states = ", ".join(f"{count} {state}" for state, count in summary.counts.items())
+    frames = f"{summary.frames:,} of {summary.total_frames:,} frames"
+    left = "" if not summary.left_s else f", about {span(summary.left_s)} left"
+    return f"{name}: {states}; {frames}{left}"
+
+
+def span(seconds: float) -> str:
+    """Return a time as people say it, such as ``3 d 4 h``, ``2 h 5 min``, ``40 s``."""
+    parts = []
+    for length, unit in ((86400, "d"), (3600, "h"), (60, "min"), (1, "s")):
+        count, seconds = divmod(round(seconds), length)
+        if count and len(parts) < 2:
+            parts.append(f"{count} {unit}")
+    return " ".join(parts) or "0 s"
+
+
+def failures(found: Sequence[Row]) -> str:
+    """Return the failed jobs with the end of each log; empty if there are none."""
+    parts = []
+    for row in found:
+        if row.state != FAILED:
+            continue
+        parts.append(
+            f"\nfailed: {row.name} (attempt {row.attempts}): {row.error}\n  log: {row.log}"
+        )
+        if row.log is not None and row.log.exists():
+            lines = row.log.read_text(errors="replace").splitlines()[-_TAIL_LINES:]
+            parts += [f"  | {line}" for line in lines]
+    return "\n".join(parts)
+
+
+def percent(value: float | None) -> str:
+    """Return a share as text."""
+    return _UNKNOWN if value is None else f"{value:.1%}"
+
+
+def _change(row: Row) -> str:
+    text = f"{row.state}: {row.name}"
+    if row.state == FINISHED:
+        return f"{text}, {row.frames:,} frames, success {percent(row.success)}"
+    return f"{text}, attempt {row.attempts}" if row.state == RUNNING else text
+
+
+def _table(name: str, found: Sequence[Row], summary: Summary) -> Group:
+    table = Table(box=None, header_style="bold")
+    for head, justify in (("running", "left"), ("", "left"), ("frames", "right")):
+        table.add_column(head, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    for head in ("steps/s", "success", "left"):
+        table.add_column(head, justify="right", no_wrap=True)
+    for row in found:
+        if row.state == RUNNING:
+            table.add_row(
+                escape(row.name),
+                ProgressBar(row.total_frames, row.frames, width=12),
+                f"{row.frames:,}/{row.total_frames:,}",
+                _UNKNOWN if row.steps_per_s is None else f"{row.steps_per_s:,.0f}",
+                percent(row.success),
+                _UNKNOWN if row.left_s is None else span(row.left_s),
+            )
+    whole = ProgressBar(summary.total_frames, summary.frames, width=40)
+    return Group(table, whole, summary_line(name, summary))

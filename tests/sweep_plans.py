@@ -1,0 +1,61 @@
+"""Small sweeps, as the planner would make them."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from command_line import TINY
+from pgdm.config.store import compose
+from pgdm.sweep.plan import Job, LocalCfg, Plan, SweepCfg, job_key
+
+SWEEP = SweepCfg(name=None, dir=None, max_attempts=2, detach=False, dry_run=False)
+LOCAL = LocalCfg(name="local", max_jobs=2, cores_per_job=1, memory_per_job_gb=1.0)
+
+
+def plan(folder: Path, jobs: int = 3, *overrides: str) -> Plan:
+    """Return a sweep over seeds; a later override of the same key wins."""
+    settings = dict(text.split("=", 1) for text in (*TINY, "offline=true", *overrides))
+    found = []
+    for seed in range(jobs):
+        mine = [f"{key}={value}" for key, value in settings.items()] + [f"seed={seed}"]
+        cfg = compose([*mine, f"run_dir={folder / 'runs' / f's{seed}'}"])
+        found.append(Job(job_key(cfg), f"seed={seed}", tuple(mine), cfg))
+    return Plan(folder.name, folder, tuple(found), "pgdm-run -m seed=0,1,2")
+
+
+def broken(whole: Plan, number: int) -> Plan:
+    """Return the plan with one job that fails whenever it is tried: its assets do not exist."""
+    job = whole.jobs[number]
+    task = dataclasses.replace(job.cfg.task, motion="no-such-motion")
+    cfg = dataclasses.replace(job.cfg, task=task)
+    jobs = list(whole.jobs)
+    jobs[number] = dataclasses.replace(job, cfg=cfg, key=job_key(cfg))
+    return dataclasses.replace(whole, jobs=tuple(jobs))
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from pgdm.cli.train import notify
+from pgdm.sweep.local import run_sweep
+from pgdm.sweep.plan import read_plan
+import sweep_plans
+plan = read_plan(Path(sys.argv[1]))
+sys.exit(run_sweep(plan, sweep_plans.SWEEP, sweep_plans.LOCAL, notify))
+"""
+
+
+def start(folder: Path, program: str = PROGRAM) -> subprocess.Popen[str]:
+    """Start a sweep that is planned, as a process of its own."""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    return subprocess.Popen(
+        [sys.executable, "-c", program, str(folder)],
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
