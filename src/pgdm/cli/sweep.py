@@ -28,7 +28,7 @@ from pgdm.sweep.ledger import (
     Entry,
     Ledger,
 )
-from pgdm.sweep.mlflow import SweepMirror
+from pgdm.sweep.mirror import SweepMirror
 from pgdm.sweep.state import NAME, SLOTS, Row, log_path, parent, rows, settle, summarize
 from pgdm.sweep.view import SweepView, failures, percent, span, summary_line
 

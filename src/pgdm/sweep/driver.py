@@ -27,7 +27,7 @@ from pgdm.sweep.ledger import (
     Entry,
     Ledger,
 )
-from pgdm.sweep.mlflow import SweepMirror
+from pgdm.sweep.mirror import SweepMirror
 from pgdm.sweep.plan import Job, Plan, job_key
 from pgdm.sweep.processes import Process
 from pgdm.sweep.state import NAME, PARENT, SLOTS, log_path, rows, settle, stand, works

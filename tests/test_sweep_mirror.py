@@ -1,0 +1,173 @@
+"""A sweep in MLflow: one run with its jobs below it, whose statuses are true after kills."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from command_line import command
+from fake_runs import empty_database, end, make, train
+from pgdm.config.saved import save_config
+from pgdm.sweep.ledger import Ending, Ledger
+from pgdm.sweep.mirror import SweepMirror
+from pgdm.sweep.plan import Plan, write_plan
+from pgdm.sweep.processes import Process
+from pgdm.tracking import RunFolder, TrackingCfg, open_tracker
+from pgdm.tracking.mlflow import Store, store_uri
+from pgdm.tracking.run_folder import LINK, read_json
+from pgdm.tracking.sync import sync
+from sweep_plans import plan, start
+
+__all__ = ["empty_database"]  # a fixture
+
+# MLflow warns of what it and its dependencies will change; that is theirs.
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+MIRRORED = ("tracking=mlflow", "tracking.experiment=other")
+
+
+@pytest.fixture
+def whole(tmp_path: Path, empty_database: Path) -> Plan:
+    """Return a planned sweep of two jobs, with an empty database beside it."""
+    shutil.copy(empty_database, tmp_path / "mlflow.db")
+    made = plan(tmp_path / "study", 2, *MIRRORED)
+    write_plan(made)
+    return made
+
+
+def runs(tmp_path: Path) -> dict[str, tuple[str, str | None]]:
+    """Return status and parent of each run by its folder."""
+    store = Store.open(store_uri(tmp_path), "other")
+    found = store.client.search_runs([store.experiment_id])
+    assert len({run.data.tags["run_dir"] for run in found}) == len(found)
+    tags = {run.info.run_id: run.data.tags for run in found}
+    return {
+        Path(run.data.tags["run_dir"]).name: (
+            run.info.status,
+            tags[run.data.tags["mlflow.parentRunId"]]["mlflow.runName"]
+            if "mlflow.parentRunId" in run.data.tags
+            else None,
+        )
+        for run in found
+    }
+
+
+def tell(text: str) -> None:
+    raise AssertionError(text)
+
+
+def test_a_sweep_is_one_run_however_often_it_is_opened(whole: Plan, tmp_path: Path) -> None:
+    for status, shown in (
+        ("interrupted", "KILLED"),
+        ("failed", "FAILED"),
+        ("finished", "FINISHED"),
+    ):
+        mirror = SweepMirror.of(whole, tell)
+        mirror.open(whole)
+        assert runs(tmp_path) == {"study": ("RUNNING", None)}
+        assert read_json(whole.folder / LINK)["status"] == "running"
+        mirror.close(status)
+        assert runs(tmp_path) == {"study": (shown, None)}
+    (whole.folder / LINK).unlink()
+    SweepMirror.of(whole, tell).open(whole)
+    assert len(runs(tmp_path)) == 1
+
+
+def test_jobs_are_shown_below_it(whole: Plan, tmp_path: Path) -> None:
+    mirror = SweepMirror.of(whole, tell)
+    mirror.open(whole)
+    folder = make(whole.folder / "runs" / "s0")
+    mirror.adopt(whole.jobs[0])
+    tracker = open_tracker(TrackingCfg("mlflow", None, "other"), folder, {})
+    train(folder)
+    end(folder)
+    tracker.finish("finished")
+    # In the sweep's store, though by itself the run would go to one beside its own folder.
+    assert runs(tmp_path) == {"study": ("RUNNING", None), "s0": ("FINISHED", "study")}
+    assert not (whole.folder / "runs" / "mlflow.db").exists()
+
+
+@pytest.mark.parametrize(("status", "shown"), [("interrupted", "KILLED"), ("finished", "FINISHED")])
+def test_a_killed_job_gets_its_true_status(
+    whole: Plan, tmp_path: Path, status: str, shown: str
+) -> None:
+    mirror = SweepMirror.of(whole, tell)
+    mirror.open(whole)
+    folder = make(whole.folder / "runs" / "s0", tracking={"experiment": "other"})
+    (folder.path / ".lock").touch()
+    mirror.adopt(whole.jobs[0])
+    tracker = open_tracker(TrackingCfg("mlflow", None, "other"), folder, {})
+    limit = time.monotonic() + 60
+    while "s0" not in runs(tmp_path) or "run_id" not in folder.link:
+        assert time.monotonic() < limit
+        time.sleep(0.1)
+    tracker._pool.shutdown()  # type: ignore[attr-defined] # as if it was killed here
+    train(folder)
+    if status == "finished":
+        end(folder)
+    mirror.correct(folder.path)
+    assert runs(tmp_path)["s0"] == (shown, "study")
+    assert [done.action for done in sync(tmp_path)] == [
+        "unchanged" if status == "finished" else "completed"
+    ]
+    assert runs(tmp_path)["s0"] == (shown, "study")
+
+
+def test_status_tells_mlflow_that_a_sweep_was_killed(whole: Plan, tmp_path: Path) -> None:
+    SweepMirror.of(whole, tell).open(whole)
+    ledger = Ledger(whole.folder)
+    ledger.add(whole)
+    for expected in ("KILLED", "FINISHED"):
+        assert command("pgdm", "sweep", "status", str(whole.folder)).code == 0
+        assert runs(tmp_path) == {"study": (expected, None)}
+        SweepMirror.of(whole, tell).open(whole)
+        for key in ledger.states():
+            number = ledger.begin(key, Process.of(os.getpid()))
+            ledger.end(key, number, Ending("finished", 0, 32, {}, None))
+            ledger.set_states({key: "finished"})
+
+
+def test_mlflow_out_of_reach_stops_nothing(whole: Plan) -> None:
+    heard: list[str] = []
+    uri = "sqlite:////proc/nowhere/mlflow.db"
+    cfg = dataclasses.replace(whole.jobs[0].cfg, tracking=TrackingCfg("mlflow", uri, "other"))
+    jobs = (dataclasses.replace(whole.jobs[0], cfg=cfg),)
+    mirror = SweepMirror.of(dataclasses.replace(whole, jobs=jobs), heard.append)
+    save_config(cfg, cfg.run_dir)
+    mirror.open(dataclasses.replace(whole, jobs=jobs))
+    mirror.correct(Path(cfg.run_dir))
+    mirror.close("finished")
+    assert len(heard) == 1 and uri in heard[0] and "the sweep goes on" in heard[0]
+
+
+@pytest.mark.slow
+def test_kills_leave_no_run_twice_and_none_running(library_home: Path, tmp_path: Path) -> None:
+    long = ("total_frames=1600", "eval.interval_frames=0", "checkpoint.interval_s=0.5")
+    whole = plan(tmp_path / "study", 2, *MIRRORED, *long)
+    write_plan(whole)
+    for pause_s in (5.0, 12.0, 15.0):
+        sweep = start(whole.folder)
+        time.sleep(pause_s)
+        for attempt in Ledger(whole.folder).attempts():
+            attempt.process.signal(signal.SIGKILL)  # at first this may be the driver itself
+        sweep.kill()
+        sweep.communicate()
+        assert command("pgdm", "sweep", "status", str(whole.folder)).code == 0
+        assert "RUNNING" not in {status for status, _ in runs(tmp_path).values()}
+    sweep = start(whole.folder)
+    _, err = sweep.communicate(timeout=300)
+    assert sweep.returncode == 0, err
+    assert runs(tmp_path) == {
+        "study": ("FINISHED", None),
+        "s0": ("FINISHED", "study"),
+        "s1": ("FINISHED", "study"),
+    }
+    counts = [done.action for done in sync(tmp_path)]
+    assert counts == ["unchanged"] * 2
+    assert RunFolder(whole.folder / "runs" / "s0").status() == "finished"
