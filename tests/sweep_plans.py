@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import IO
 
 from command_line import TINY
 from pgdm.config.store import compose
@@ -40,6 +41,7 @@ def broken(whole: Plan, number: int) -> Plan:
 PROGRAM = """
 import sys
 from pathlib import Path
+from typing import IO
 from pgdm.cli.train import notify
 from pgdm.sweep.local import run_sweep
 from pgdm.sweep.plan import read_plan
@@ -49,13 +51,18 @@ sys.exit(run_sweep(plan, sweep_plans.SWEEP, sweep_plans.LOCAL, notify))
 """
 
 
-def start(folder: Path, program: str = PROGRAM) -> subprocess.Popen[str]:
-    """Start a sweep that is planned, as a process of its own."""
+def start(folder: Path, output: IO[str] | None = None) -> subprocess.Popen[str]:
+    """Start a sweep that is planned, as a process of its own.
+
+    Args:
+        folder: of the sweep.
+        output: where it prints to; None: into pipes.
+    """
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     return subprocess.Popen(
-        [sys.executable, "-c", program, str(folder)],
+        [sys.executable, "-c", PROGRAM, str(folder)],
         env=env,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stdout=output or subprocess.PIPE,
+        stderr=output or subprocess.PIPE,
         text=True,
     )

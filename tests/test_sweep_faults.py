@@ -31,6 +31,7 @@ SMALL = (
     "eval.interval_frames=2560",
     "checkpoint.interval_s=0.3",
 )
+FURTHEST: dict[str, int] = {}
 TIMED = ("time_s", "train/steps_per_s")
 
 
@@ -80,6 +81,17 @@ def locked(folder: Path) -> Iterator[None]:
         db.execute("ROLLBACK")
 
 
+def wait_for_progress(folder: Path, sweep: subprocess.Popen[str]) -> None:
+    """Wait until any job has come further than it ever was, or the sweep has ended."""
+    limit = time.monotonic() + 180
+    while sweep.poll() is None and time.monotonic() < limit:
+        reached = {row.key: row.frames for row in rows(Ledger(folder)) if row.state == "running"}
+        if any(frames > FURTHEST.get(key, 0) for key, frames in reached.items()):
+            FURTHEST.update(reached)
+            return
+        time.sleep(0.1)
+
+
 def strike(kind: str, folder: Path, sweep: subprocess.Popen[str], rng: random.Random) -> None:
     if kind in ("parent", "both"):
         sweep.kill()
@@ -95,25 +107,23 @@ def test_twenty_faults_change_nothing(disk: Path, tmp_path: Path) -> None:
     straight, struck = tmp_path / "straight", disk / "struck"
     for folder in (straight, struck):
         write_plan(plan(folder, JOBS, *SMALL))
-    undisturbed = start(straight)
-    assert undisturbed.wait(900) == 0
-
-    rng = random.Random(20)
-    kinds = ["worker", "parent", "both", "disk", "ledger"] * (FAULTS // 5)
-    rng.shuffle(kinds)
-    sweep = start(struck)
-    for kind in kinds:
-        time.sleep(rng.uniform(0.0, 12.0))
-        if sweep.poll() is not None:
-            sweep = start(struck)
-            time.sleep(rng.uniform(0.0, 12.0))
-        strike(kind, struck, sweep, rng)
-    sweep.wait(900)
-    for _ in range(3):  # a job may have used up its attempts
-        sweep = start(struck)
-        if sweep.wait(900) == 0:
-            break
-    assert sweep.returncode == 0, sweep.communicate()
+    with open(tmp_path / "output.txt", "a+") as output:
+        assert start(straight, output).wait(900) == 0
+        rng = random.Random(20)
+        kinds = ["worker", "parent", "both", "disk", "ledger"] * (FAULTS // 5)
+        rng.shuffle(kinds)
+        sweep = start(struck, output)
+        for kind in kinds:
+            if sweep.poll() is not None:
+                sweep = start(struck, output)
+            if rng.random() < 0.8:  # else perhaps before anything has begun
+                wait_for_progress(struck, sweep)
+            time.sleep(rng.uniform(0.0, 3.0))
+            strike(kind, struck, sweep, rng)
+        code = sweep.wait(900)
+        if code != 0:  # the last fault ended it, or used up a job's attempts
+            code = start(struck, output).wait(900)
+        assert code == 0, (tmp_path / "output.txt").read_text()
 
     found = rows(Ledger(struck))
     assert [row.state for row in found] == ["finished"] * JOBS

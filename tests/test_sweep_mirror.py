@@ -123,8 +123,11 @@ def test_status_tells_mlflow_that_a_sweep_was_killed(whole: Plan, tmp_path: Path
     SweepMirror.of(whole, tell).open(whole)
     ledger = Ledger(whole.folder)
     ledger.add(whole)
-    for expected in ("KILLED", "FINISHED"):
-        assert command("pgdm", "sweep", "status", str(whole.folder)).code == 0
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "sweeps").symlink_to(tmp_path)
+    ways = {"KILLED": ("sweep", "status", str(whole.folder)), "FINISHED": ("runs", "sync")}
+    for expected, way in ways.items():
+        assert command("pgdm", *way).code == 0
         assert runs(tmp_path) == {"study": (expected, None)}
         SweepMirror.of(whole, tell).open(whole)
         for key in ledger.states():

@@ -16,6 +16,7 @@ from rich.table import Table
 from typer.core import TyperGroup
 
 from pgdm import paths
+from pgdm.cli.sweep import settled
 from pgdm.errors import RunError
 from pgdm.tracking.run_folder import RunFolder, find_runs
 from pgdm.tracking.run_log import metrics_of
@@ -77,6 +78,8 @@ def sync_runs(root: Root = None, uri: Uri = None) -> None:
     from pgdm.tracking.sync import Synced, sync
 
     root = _existing(root)
+    for plan in sorted(root.glob("sweeps/*/plan.json")):
+        settled(plan.parent)
 
     def notify(done: Synced) -> None:
         reason = f" ({done.reason})" if done.reason else ""

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pgdm.cli.errors import INTERRUPTED as INTERRUPTED_CODE
 from pgdm.errors import SweepError, UnknownNameError
 from pgdm.sweep.ledger import (
     CANCELLED,
@@ -60,7 +61,7 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
     """Show each job: state, frames, success, attempts, time left; and all of it in one line."""
-    ledger = _settled(folder)
+    ledger = settled(folder)
     found = rows(ledger)
     summary = summarize(found, ledger.fact(SLOTS) or 1)
     if as_json:
@@ -78,12 +79,16 @@ def status(
 @app.command()
 def watch(folder: Folder) -> None:
     """Follow a sweep until it ends; Ctrl-C only ends the watching."""
-    ledger = _settled(folder)
-    with SweepView(ledger.fact(NAME) or folder.name, ledger) as view:
-        while parent(ledger) is not None:
-            view.update()
-            time.sleep(_POLL_S)
-    settle(ledger)
+    ledger = settled(folder)
+    try:
+        with SweepView(ledger.fact(NAME) or folder.name, ledger) as view:
+            while parent(ledger) is not None:
+                view.update()
+                time.sleep(_POLL_S)
+    except KeyboardInterrupt:
+        print(f"the sweep goes on; pgdm sweep cancel {folder} ends it", file=sys.stderr)
+        raise typer.Exit(INTERRUPTED_CODE) from None
+    settled(folder)
     print(view.line())
     if text := failures(rows(ledger)):
         print(text)
@@ -97,7 +102,7 @@ def logs(
     follow: Annotated[bool, typer.Option("-f", "--follow", help="Go on until it ends.")] = False,
 ) -> None:
     """Print what a job's last attempt printed."""
-    ledger = _settled(folder)
+    ledger = settled(folder)
     entry = _one(ledger.entries(), job)
     if entry.last is None:
         raise SweepError(f"{entry.name} has not been started yet")
@@ -118,7 +123,7 @@ def logs(
 @app.command()
 def cancel(folder: Folder, jobs: Jobs = None) -> None:
     """Stop jobs, or all that are not finished: running ones save what they have reached."""
-    ledger = _settled(folder)
+    ledger = settled(folder)
     ended = (FINISHED, FAILED) if not jobs else (FINISHED,)
     chosen = [entry for entry in _chosen(ledger, jobs) if entry.state not in ended]
     keys = {entry.key for entry in chosen}
@@ -138,7 +143,7 @@ def cancel(folder: Folder, jobs: Jobs = None) -> None:
 @app.command()
 def retry(folder: Folder, jobs: Jobs = None) -> None:
     """Try failed jobs again, or the named ones: here, or by who drives the sweep now."""
-    ledger = _settled(folder)
+    ledger = settled(folder)
     wanted = _chosen(ledger, jobs)
     chosen = [e for e in wanted if e.state == FAILED or (jobs and e.state != FINISHED)]
     chosen = [e for e in chosen if e.state != RUNNING]
@@ -155,7 +160,7 @@ def retry(folder: Folder, jobs: Jobs = None) -> None:
 @app.command()
 def resume(folder: Folder, detach: Detach = False) -> None:
     """Go on with all that is not finished, as the sweep was started; needs no other settings."""
-    _settled(folder)
+    settled(folder)
     raise typer.Exit(_go_on(folder, detach=detach))
 
 
@@ -172,7 +177,7 @@ def _go_on(folder: Path, detach: bool = False, keys: set[str] | None = None) -> 
     return run_sweep(plan, dataclasses.replace(sweep, detach=detach), launcher, notify)
 
 
-def _settled(folder: Path) -> Ledger:
+def settled(folder: Path) -> Ledger:
     """Return a sweep's ledger, brought to the truth, and MLflow with it."""
     if not (folder / _PLAN).exists():
         raise SweepError(f"'{folder}' holds no sweep: it has no {_PLAN}")

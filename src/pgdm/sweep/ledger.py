@@ -121,7 +121,11 @@ class Ledger:
 
     def entries(self) -> list[Entry]:
         """Return all jobs in the order of the plan."""
-        last = {attempt.key: attempt for attempt in self.attempts()}
+        newest = self._read(
+            "SELECT * FROM attempts "
+            "WHERE (key, number) IN (SELECT key, max(number) FROM attempts GROUP BY key)"
+        )
+        last = {attempt.key: attempt for attempt in map(_attempt, newest)}
         rows = self._read("SELECT key, name, run_dir, total_frames, state FROM jobs ORDER BY place")
         return [
             Entry(key, name, self.folder / run_dir, total, state, last.get(key))

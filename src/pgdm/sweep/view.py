@@ -18,7 +18,7 @@ from pgdm.sweep.state import SLOTS, Row, Summary, rows, summarize
 
 PLAIN_INTERVAL_S = 30.0
 """Time between two plain lines."""
-_REFRESH_S = 1.0
+_REFRESH_S = 2.0
 _TAIL_LINES = 15
 _UNKNOWN = "-"
 
