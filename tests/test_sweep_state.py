@@ -145,6 +145,7 @@ def test_logs_have_names_that_any_disk_takes(tmp_path: Path) -> None:
     assert log_path(tmp_path, "task=cup-pour1 seed=1", 2).name == "task=cup-pour1_seed=1.2.log"
     assert log_path(tmp_path, "a/../b" * 100, 1).parent == tmp_path / "logs"
     assert len(log_path(tmp_path, "a/../b" * 100, 1).name) < 200
+    assert log_path(tmp_path, "a" * 200 + "1", 1) != log_path(tmp_path, "a" * 200 + "2", 1)
 
 
 @pytest.mark.parametrize(

@@ -133,6 +133,7 @@ class Driver:
         for entry in ledger.entries():
             if entry.last is not None and entry.last.state == RUNNING:
                 self._left_over.append(entry)
+                states[entry.key] = RUNNING
             elif entry.key in self._jobs:
                 states[entry.key] = self._first_state(entry)
         ledger.set_states(states)
@@ -146,7 +147,9 @@ class Driver:
     def _loop(self, stop: StopRequest) -> None:
         while True:
             self._reap()
-            self._wait_for_others(stop())
+            if stop():
+                self._left_over.clear()  # they have been stopping since their own driver went
+            self._take_over()
             states = self._ledger.states()
             for worker in self._workers:
                 if stop() or states[worker.job.key] == CANCELLED:
@@ -195,7 +198,7 @@ class Driver:
             job, key = worker.job, worker.job.key
             ending = self._ending(worker)
             self._ledger.end(key, worker.number, ending)
-            if worker.process.returncode < 0:
+            if worker.process.returncode != 0:
                 self._mirror.correct(Path(job.cfg.run_dir))
             if ending.state == FINISHED or self._ledger.states()[key] == CANCELLED:
                 state = FINISHED if ending.state == FINISHED else CANCELLED
@@ -222,7 +225,7 @@ class Driver:
             state, error = FAILED, _last_error(log)
         return Ending(state, code, found.frames, found.metrics, error)
 
-    def _wait_for_others(self, stopping: bool) -> None:
+    def _take_over(self) -> None:
         """Take over the jobs whose workers a killed driver left, once these have ended."""
         for entry in list(self._left_over):
             assert entry.last is not None
@@ -232,8 +235,10 @@ class Driver:
             ending = stand(entry.run_dir, entry.total_frames)
             self._ledger.end(entry.key, entry.last.number, ending)
             self._mirror.correct(entry.run_dir)
-            left = INTERRUPTED if stopping or entry.key not in self._jobs else WAITING
-            self._ledger.set_states({entry.key: FINISHED if ending.state == FINISHED else left})
+            if ending.state == FINISHED or entry.key not in self._jobs:
+                self._ledger.set_states({entry.key: ending.state})
+            elif self._ledger.states()[entry.key] != CANCELLED:
+                self._ledger.set_states({entry.key: WAITING})
 
     def _end(self) -> None:
         """Leave no worker behind, whatever went wrong."""

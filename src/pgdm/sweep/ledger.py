@@ -147,7 +147,8 @@ class Ledger:
             "SELECT ?1, coalesce(max(number), 0) + 1, 'running', ?2, ?3, ?4, ?5 "
             "FROM attempts WHERE key = ?1",
             [(key, process.host, process.pid, process.born, time.time())],
-            ("UPDATE jobs SET state = 'running' WHERE key = ?", (key,)),
+            # Cancelled in this moment: its driver sees that, and stops it again.
+            ("UPDATE jobs SET state = 'running' WHERE key = ? AND state != 'cancelled'", (key,)),
         )
         ((number,),) = self._read("SELECT max(number) FROM attempts WHERE key = ?", (key,))
         return number

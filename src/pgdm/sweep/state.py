@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
 from collections import Counter
@@ -31,6 +32,7 @@ NAME, PARENT, SLOTS = "name", "parent", "slots"
 """Facts in the ledger: the sweep's name, the process that drives it, and its jobs at a time."""
 LOGS = "logs"
 _TAIL_BYTES = 1 << 14  # a dozen lines
+_LONGEST = 150
 _LEFT = (WAITING, RUNNING, INTERRUPTED)
 
 
@@ -148,7 +150,9 @@ def summarize(found: Sequence[Row], slots: int) -> Summary:
 def log_path(folder: Path, name: str, attempt: int) -> Path:
     """Return the file with the output of an attempt at a job."""
     safe = "".join(c if c.isalnum() or c in "=.,+-" else "_" for c in name)
-    return folder / LOGS / f"{safe[:150]}.{attempt}.log"
+    if len(safe) > _LONGEST:  # what tells jobs apart may stand at the end
+        safe = f"{safe[:_LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return folder / LOGS / f"{safe}.{attempt}.log"
 
 
 def _row(folder: Path, entry: Entry) -> Row:
