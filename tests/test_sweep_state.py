@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
@@ -7,13 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from pgdm.sweep.driver import Room
 from pgdm.sweep.ledger import Ending, Ledger
 from pgdm.sweep.local import free_memory_gb, room
 from pgdm.sweep.processes import Process
 from pgdm.sweep.state import PARENT, Row, log_path, parent, rows, settle, stand, summarize
-from pgdm.sweep.view import failures, span, summary_line
+from pgdm.sweep.view import failures, live_table, span, summary_line
 from pgdm.tracking.run_log import RunLog
 from sweep_plans import LOCAL, plan
 
@@ -119,6 +121,20 @@ def test_a_sweep_as_a_whole() -> None:
     assert summary_line("x", summarize(found, 1)) == (
         "x: 1 waiting, 1 running, 1 finished, 1 failed; 157 of 400 frames, about 50 s left"
     )
+
+
+def test_the_live_table_shows_what_runs() -> None:
+    running = row("running", 50, 4.0, name="seed=1", steps_per_s=5.0, success=0.25, left_s=12.5)
+    found = [row("finished", 100), running, row("waiting", 0, name="seed=2")]
+    console = Console(width=100, file=io.StringIO())
+    console.print(live_table("x", found, summarize(found, 2)))
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert lines[0].split() == ["running", "frames", "steps/s", "success", "left"]
+    assert [word for word in lines[1].split() if word.isascii()] == [
+        *("seed=1", "50/100", "5", "25.0%", "12", "s")
+    ]
+    assert len(lines) == 4
+    assert lines[3].strip().startswith("x: 1 waiting, 1 running, 1 finished; 150 of 300 frames")
 
 
 def test_times_as_people_say_them() -> None:

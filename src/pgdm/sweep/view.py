@@ -12,6 +12,7 @@ from rich.live import Live
 from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Table
+from rich.text import Text
 
 from pgdm.sweep.ledger import FAILED, FINISHED, RUNNING, WAITING, Ledger
 from pgdm.sweep.state import SLOTS, Row, Summary, rows, summarize
@@ -60,7 +61,7 @@ class SweepView:
         found = rows(self._ledger)
         summary = summarize(found, self._ledger.fact(SLOTS) or 1)
         if self._console.is_terminal:
-            self._live.update(_table(self._name, found, summary), refresh=True)
+            self._live.update(live_table(self._name, found, summary), refresh=True)
             return
         for row in found:
             if self._states.get(row.key, WAITING) != row.state:
@@ -124,11 +125,12 @@ def _change(row: Row) -> str:
     return f"{text}, attempt {row.attempts}" if row.state == RUNNING else text
 
 
-def _table(name: str, found: Sequence[Row], summary: Summary) -> Group:
+def live_table(name: str, found: Sequence[Row], summary: Summary) -> Group:
+    """Return the running jobs as a table, and the whole sweep below it."""
     table = Table(box=None, header_style="bold")
-    for head, justify in (("running", "left"), ("", "left"), ("frames", "right")):
-        table.add_column(head, justify=justify, no_wrap=True)  # type: ignore[arg-type]
-    for head in ("steps/s", "success", "left"):
+    for head in ("running", ""):
+        table.add_column(head, no_wrap=True)
+    for head in ("frames", "steps/s", "success", "left"):
         table.add_column(head, justify="right", no_wrap=True)
     for row in found:
         if row.state == RUNNING:
@@ -140,5 +142,6 @@ def _table(name: str, found: Sequence[Row], summary: Summary) -> Group:
                 percent(row.success),
                 _UNKNOWN if row.left_s is None else span(row.left_s),
             )
-    whole = ProgressBar(summary.total_frames, summary.frames, width=40)
-    return Group(table, whole, summary_line(name, summary))
+    whole = Table.grid()  # a bar alone does not end its line
+    whole.add_row(ProgressBar(summary.total_frames, summary.frames, width=40))
+    return Group(table, whole, Text(summary_line(name, summary)))
