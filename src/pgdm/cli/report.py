@@ -40,8 +40,8 @@ def _shown() -> Iterator[Progress]:
 
         def progress(step: str, done: int, total: int) -> None:
             bar.update(row, description=step, completed=done, total=total)
-            if console.is_terminal and time.monotonic() - began > _PATIENCE_S:
-                if not bar.live.is_started:
-                    stack.enter_context(bar)
+            late = time.monotonic() - began > _PATIENCE_S
+            if late and console.is_terminal and not bar.live.is_started:
+                stack.enter_context(bar)
 
         yield progress

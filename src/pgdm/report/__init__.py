@@ -1,1 +1,1 @@
-"""Results as a page, tables and pictures, beside the paper's figures and what doing nothing gives."""
+"""Results as a page, tables and pictures, beside the paper's and those of doing nothing."""

@@ -128,9 +128,11 @@ def _panel(
     axes.add_collection(LineCollection(thick, colors=shades, linewidths=1.6))
     ends = np.array([0.0, scale.furthest])
     for value, style in _levels(results, task, metric, scale):
-        axes.plot(*place(ends, np.array([value, value])).T, color=_GREY, lw=0.9, ls=style)
+        x, y = place(ends, np.array([value, value])).T
+        axes.plot(x, y, color=_GREY, lw=0.9, ls=style)
     _frame(axes, place, scale)
-    axes.text(*(origin + size * (0.5, 1.06)), task, fontsize=9, ha="center")
+    x, y = origin + size * (0.5, 1.06)
+    axes.text(x, y, task, fontsize=9, ha="center")
 
 
 def _levels(results: Results, task: str, metric: str, scale: _Scale) -> Iterator[tuple[float, str]]:
@@ -149,7 +151,7 @@ def _frame(axes: Axes, place: Callable[[Array, Array], Array], scale: _Scale) ->
     values = list(scale.ticks())
     low, high = values[0][0], values[-1][0]
     corner = place(np.array([0.0, 0.0, scale.furthest]), np.array([high, low, low]))
-    axes.plot(*corner.T, color="black", lw=0.7)
+    axes.plot(corner[:, 0], corner[:, 1], color="black", lw=0.7)
     for value, text in values:
         x, y = place(np.array([0.0]), np.array([value]))[0]
         axes.text(x - 0.06, y, text, fontsize=8, ha="right", va="center")

@@ -85,6 +85,7 @@ def _rows(names: Sequence[str]) -> tuple[Figure, Axes]:
     figure, axes = _plain(0.6 + (0.2 + 0.16 * lines) * len(names))
     axes.set_yticks(range(len(names)), wrapped)
     axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_axisbelow(True)
     axes.grid(axis="x", lw=0.4, alpha=0.5)
     return figure, axes
 
@@ -119,5 +120,5 @@ def thumbnail(poster: Path) -> bytes | None:
 def png(picture: Image.Image) -> bytes:
     """Return a drawing as PNG with few colours, a quarter of the size."""
     stream = io.BytesIO()
-    picture.quantize(64, method=Image.Quantize.FASTOCTREE).save(stream, "PNG")
+    picture.quantize(64).save(stream, "PNG")
     return stream.getvalue()

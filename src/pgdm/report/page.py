@@ -14,7 +14,6 @@ from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from pgdm.config.store import PAPER_FRAMES
 from pgdm.errors import RunError
@@ -26,7 +25,7 @@ from pgdm.report.source import Found, Progress, find
 from pgdm.report.statistics import DRAWS, Estimate
 
 PAGE = "report.html"
-_NONE = "–"
+_NONE = "-"
 
 
 def write_report(
@@ -217,8 +216,8 @@ def _reason(run: Run) -> str:
     return str(run.result.get("error", ""))
 
 
-def _data(picture: bytes, kind: str = "png") -> Markup:
-    return Markup(f"data:image/{kind};base64,{base64.b64encode(picture).decode()}")
+def _data(picture: bytes, kind: str = "png") -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
 
 
 def states_text(counts: dict[str, int]) -> str:

@@ -39,9 +39,10 @@ class Results:
             best[run.setting, run.task, run.seed] = run
         kept = {run.path for run in best.values()}
         self.doubles = [run for run in runs if run.path not in kept]
-        self.runs = sorted(best.values(), key=lambda run: (run.task, run.seed, str(run.path)))
-        found = {run.setting for run in self.runs}
+        found = {run.setting for run in best.values()}
         self.settings = sorted(found, key=lambda s: (len(s.changes), -s.total_frames, s.changes))
+        place = {setting: number for number, setting in enumerate(self.settings)}
+        self.runs = sorted(best.values(), key=lambda r: (r.task, place[r.setting], r.seed))
         self.labels = labels(self.settings)
         self.tasks = sorted({run.task for run in self.runs})
         self._cells: dict[tuple[Setting, str], list[Run]] = {}
@@ -85,10 +86,7 @@ class Results:
         found = setting.deviations(*groups)
         asked = setting.option("pregrasp")
         starts = Counter(r.start for r in self.runs if r.setting == setting and r.start != asked)
-        found += [
-            f"pre-grasp {start} in {n} runs ({asked} is missing)" for start, n in starts.items()
-        ]
-        return found
+        return found + [f"start {start}, not {asked}: {n} runs" for start, n in starts.items()]
 
     def counts(self) -> dict[str, int]:
         """Return how many runs are in each state."""

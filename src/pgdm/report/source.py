@@ -157,10 +157,11 @@ def _copied(client: MlflowClient, run: MlflowRun, place: Path) -> Path:
         frames = max((step for _, step in lines), default=0)
         facts = {fact: run.data.tags[fact] for fact in FACTS if fact in run.data.tags}
         write_json(folder / RESULT, {"status": status, "frames": frames, **facts})
-    films = [a.path for a in client.list_artifacts(run_id, "videos")]
-    for film in (max((f for f in films if f.endswith(e)), default=None) for e in (".mp4", ".png")):
-        if film is not None:
-            client.download_artifacts(run_id, film, str(folder))
+    (folder / "videos").mkdir(exist_ok=True)
+    last = sorted(artifact.path for artifact in client.list_artifacts(run_id, "videos"))[-2:]
+    for film in last:  # and its poster, which has its name
+        there = Path(client.download_artifacts(run_id, film, str(folder)))
+        there.replace(folder / "videos" / there.name)
     return folder
 
 
