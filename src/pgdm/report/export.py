@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ def runs(results: Results, out: Path) -> None:
             *("yes" if run.finished else "no", run.frames, run.setting.total_frames, run.budget),
             *(run.start, run.result.get("wall_time_s", ""), run.result.get("git", "")),
             *(run.metric(name) for name in METRICS),
-            str(run.path),
+            os.path.relpath(run.path, out.absolute()),
         ]
         for run in results.runs
     ]

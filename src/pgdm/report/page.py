@@ -96,6 +96,7 @@ def _context(
         "commands": _commands(results),
         "typed": found.commands,
         "unreadable": found.unreadable,
+        "folders": {run.path: os.path.relpath(run.path, out.absolute()) for run in results.runs},
         "paper_frames": PAPER_FRAMES,
         "draws": DRAWS,
         "files": sorted(p.name for p in out.iterdir() if p.suffix in (".csv", ".png")),

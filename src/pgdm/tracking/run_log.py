@@ -120,7 +120,7 @@ class RunLog:
             return []
         except OSError as error:
             raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
-        starts = {raw.find(b"\n", len(raw) * i // points) + 1 for i in range(points)}
+        starts = {raw.rfind(b"\n", 0, len(raw) * i // points) + 1 for i in range(points)}
         at = raw.find(_EVALUATION)
         while at >= 0:
             starts.add(raw.rfind(b"\n", 0, at) + 1)
