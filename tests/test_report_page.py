@@ -23,10 +23,10 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 CSVS = ["averages", "curves", "profiles", "runs", "statistics", "tasks"]
 
 
-@pytest.fixture
-def runs(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return two settings on three tasks, with a failed and a running run and a missing seed."""
-    root = tmp_path / "runs"
+    root = tmp_path_factory.mktemp("report") / "runs"
     for seed, success in enumerate((0.5, 0.7)):
         make(root / f"cup{seed}", success, "task=cup-pour1", f"seed={seed}")
         make(root / f"tooth{seed}", 0.3, "task=toothbrush-lift", f"seed={seed}")
@@ -37,13 +37,19 @@ def runs(tmp_path: Path) -> Path:
     return root
 
 
+@pytest.fixture(scope="module")
+def page(runs: Path) -> Path:
+    """Return the report on these runs."""
+    return write_report([str(runs)], runs.parent / "out", lambda *_: None)[0]
+
+
 def report(*places: Path | str, out: Path | None = None) -> str:
     folder = out or Path("out")
     page, _ = write_report([str(place) for place in places], folder, lambda *_: None)
     return page.read_text(encoding="utf-8")
 
 
-def rows(name: str, out: str = "out") -> list[dict[str, str]]:
+def rows(name: str, out: Path | str = "out") -> list[dict[str, str]]:
     with open(Path(out) / f"{name}.csv", newline="") as file:
         return list(csv.DictReader(file))
 
@@ -54,8 +60,8 @@ def text_of(page: str) -> str:
     return " ".join(re.sub(r"<[^>]+>", " ", body).split())
 
 
-def test_what_the_page_says(runs: Path) -> None:
-    text = text_of(report(runs))
+def test_what_the_page_says(page: Path) -> None:
+    text = text_of(page.read_text())
     assert "6 finished 1 running 1 failed" in text
     assert "smoke budget" in text
     assert "All runs train for 40,960 frames; the paper's figures are after 50,000,000." in text
@@ -74,56 +80,55 @@ def test_what_the_page_says(runs: Path) -> None:
     assert "git revision 0123abc" in text
 
 
-def test_no_better_than_doing_nothing_is_red(runs: Path) -> None:
-    found = re.findall(r'<th>([a-z0-9-]+)</th>\s*<td class="bad"><b>', report(runs))
+def test_no_better_than_doing_nothing_is_red(page: Path) -> None:
+    found = re.findall(r'<th>([a-z0-9-]+)</th>\s*<td class="bad"><b>', page.read_text())
     assert found == ["toothbrush-lift"]  # 30% where nothing gives 45%; failed runs have no number
 
 
-def test_all_files_are_there_and_pictures_are_whole(runs: Path) -> None:
-    page = report(runs)
-    assert sorted(p.stem for p in Path("out").glob("*.csv")) == CSVS
-    pictures = sorted(Path("out").glob("*.png"))
+def test_all_files_are_there_and_pictures_are_whole(page: Path) -> None:
+    assert sorted(p.stem for p in page.parent.glob("*.csv")) == CSVS
+    pictures = sorted(page.parent.glob("*.png"))
     names = ["baselines", "curves", "curves_error", "iqm", "profiles"]
     assert [p.stem for p in pictures] == names
-    inside = re.findall(r'src="data:image/(?:png|jpeg);base64,([^"]+)"', page)
+    inside = re.findall(r'src="data:image/(?:png|jpeg);base64,([^"]+)"', page.read_text())
     assert len(inside) == 3 + 2 * 3 + 8  # statistics, a panel a task and metric, films
     for data in inside:
         with Image.open(io.BytesIO(base64.b64decode(data))) as picture:
             picture.load()
 
 
-def test_nothing_is_loaded_from_elsewhere(runs: Path) -> None:
-    page = report(runs)
-    assert re.findall(r"https?://|<script|<link|@import|url\(", page) == []
-    assert "default-src 'none'; img-src data:" in page
-    films = re.findall(r'href="([^"]+\.mp4)"', page)
+def test_nothing_is_loaded_from_elsewhere(page: Path) -> None:
+    text = page.read_text()
+    assert re.findall(r"https?://|<script|<link|@import|url\(", text) == []
+    assert "default-src 'none'; img-src data:" in text
+    films = re.findall(r'href="([^"]+\.mp4)"', text)
     assert len(films) == 8
-    assert all((Path("out") / film).read_bytes() == b"film" for film in films)
+    assert all((page.parent / film).read_bytes() == b"film" for film in films)
 
 
-def test_numbers_can_be_computed_anew_from_runs(runs: Path) -> None:
-    report(runs)
+def test_numbers_can_be_computed_anew_from_runs(page: Path) -> None:
+    out = page.parent
     scores: dict[tuple[str, str], list[float]] = {}
-    for run in rows("runs"):
+    for run in rows("runs", out):
         if run["counted"] == "yes":
             key = run["setting"], run["task"]
             scores.setdefault(key, []).append(float(run["eval_sampled/success"]))
-    for row in rows("tasks"):
+    for row in rows("tasks", out):
         own = scores.get((row["setting"], row["task"]), [])
         assert row["seeds_finished"] == str(len(own))
         assert row["success"] == (f"{np.mean(own):.6g}" if own else "")
         assert row["comparable_with_paper"] == "no"
-    for row in rows("statistics"):
+    for row in rows("statistics", out):
         if row["statistic"] == "interquartile_mean":
             own = [np.array(v) for (s, _), v in scores.items() if s == row["setting"]]
             assert float(row["value"]) == pytest.approx(statistics.iqm(own).value, rel=1e-5)
-    better = next(r for r in rows("statistics") if r["statistic"] == "improvement")
+    better = next(r for r in rows("statistics", out) if r["statistic"] == "improvement")
     assert (better["value"], better["tasks"]) == ("1", "1")  # only cup-pour1 is shared
 
 
-def test_table_one_and_baselines(runs: Path) -> None:
-    report(runs)
-    found = {(r["table"], r["row"], r["tasks"]): r for r in rows("averages")}
+def test_table_one_and_baselines(page: Path) -> None:
+    out = page.parent
+    found = {(r["table"], r["row"], r["tasks"]): r for r in rows("averages", out)}
     every = found["source", "all", "3"]
     assert float(every["success"]) == pytest.approx((0.6 + 0.3 + 0.8) / 3, rel=1e-5)
     assert every["paper_success"] == "0.745"
@@ -135,7 +140,7 @@ def test_table_one_and_baselines(runs: Path) -> None:
     assert float(found["source", "mocap", "2"]["success"]) == pytest.approx(0.45)
     assert found["baseline", "pgdm with pre-grasp", "1"]["success"] == "0.6"  # cup-pour1
     assert found["baseline", "pgdm without pre-grasp", "1"]["success"] == "0.1"
-    assert [r for r in rows("averages") if r["table"] == "ablation"] == []
+    assert [r for r in rows("averages", out) if r["table"] == "ablation"] == []
 
 
 def test_ablations_stand_beside_the_papers(tmp_path: Path) -> None:
@@ -216,18 +221,18 @@ FRAME = """<script>addEventListener("message", e => document.title = e.data)</sc
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
 @pytest.mark.parametrize("width", [390, 1280])
-def test_fits_phone_and_desktop(runs: Path, tmp_path: Path, width: int) -> None:
+def test_fits_phone_and_desktop(page: Path, tmp_path: Path, width: int) -> None:
     assert CHROMIUM is not None
-    page = report(runs).replace("<details >", "<details open>")  # so that nothing hides
-    page = re.sub(r"<meta http-equiv[^>]+>", "", page).replace("</body>", f"{PROBE}</body>")
-    (tmp_path / "out" / "probe.html").write_text(page, encoding="utf-8")
-    (tmp_path / "out" / "frame.html").write_text(FRAME.format(width), encoding="utf-8")
+    text = page.read_text().replace("<details >", "<details open>")  # so that nothing hides
+    text = re.sub(r"<meta http-equiv[^>]+>", "", text).replace("</body>", f"{PROBE}</body>")
+    (tmp_path / "probe.html").write_text(text, encoding="utf-8")
+    (tmp_path / "frame.html").write_text(FRAME.format(width), encoding="utf-8")
     command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
     command += ["--disable-background-networking", "--disable-component-update", "--no-first-run"]
     command += ["--host-resolver-rules=MAP * ~NOTFOUND", "--hide-scrollbars"]
     command += [f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=10000"]
     done = subprocess.run(
-        [*command, "--dump-dom", (tmp_path / "out" / "frame.html").as_uri()],
+        [*command, "--dump-dom", (tmp_path / "frame.html").as_uri()],
         capture_output=True,
         text=True,
         timeout=240,

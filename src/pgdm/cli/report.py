@@ -20,13 +20,14 @@ _PATIENCE_S = 2.0
 
 def make_report(places: list[str], out: Path | None, uri: str | None) -> None:
     """Write the report and say where it is."""
-    from pgdm.report.page import states_text, write_report
+    from pgdm.report.page import write_report
 
     first = Path(places[0])
     folder = out or (first if first.is_dir() else Path("runs")) / "report"
     with _shown() as progress:
         page, results = write_report(places, folder, progress, uri)
-    print(f"{len(results.runs)} runs ({states_text(results.counts())}): {page}")
+    states = ", ".join(f"{count} {state}" for state, count in results.counts().items())
+    print(f"{len(results.runs)} runs ({states}): {page}")
 
 
 @contextlib.contextmanager

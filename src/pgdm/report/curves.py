@@ -43,8 +43,7 @@ class _Scale:
 
     def __call__(self, frames: Array, values: Array) -> Array:
         """Return places in the unit square, (N, 2); what is not finite is left out."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            y = np.log10(values) if self.logarithmic else np.asarray(values)
+        y = np.log10(values.clip(10.0**self.low)) if self.logarithmic else values
         places = np.column_stack([frames / self.furthest, (y - self.low) / (self.high - self.low)])
         return places[np.isfinite(places).all(axis=1)].clip(-0.02, 1.02)
 
@@ -116,7 +115,7 @@ def _panel(
         shade = colour(results, setting)
         lines = [place(run.evaluations["frames"], run.evaluations[metric]) for run in runs]
         thin += [(line, shade) for line in lines if len(runs) > 1]
-        frames, mean, spread = mean_curve(runs, metric)
+        frames, mean, spread = mean_curve([r for r in runs if r.finished] or runs, metric)
         thick.append(place(frames, mean))
         shades.append(shade)
         upper, lower = place(frames, mean + spread), place(frames, mean - spread)
@@ -127,7 +126,7 @@ def _panel(
     )
     axes.add_collection(LineCollection(thick, colors=shades, linewidths=1.6))
     ends = np.array([0.0, scale.furthest])
-    for value, style in _levels(results, task, metric, scale):
+    for value, style in _levels(results, task, metric):
         x, y = place(ends, np.array([value, value])).T
         axes.plot(x, y, color=_GREY, lw=0.9, ls=style)
     _frame(axes, place, scale)
@@ -135,14 +134,14 @@ def _panel(
     axes.text(x, y, task, fontsize=9, ha="center")
 
 
-def _levels(results: Results, task: str, metric: str, scale: _Scale) -> Iterator[tuple[float, str]]:
+def _levels(results: Results, task: str, metric: str) -> Iterator[tuple[float, str]]:
     """Give what a task's curves are to be compared with, and the style of its line."""
     null = paper()["null_policy"].get(task)
     if metric == SUCCESS and null is not None:
         yield null, ":"
     runs = [run for setting in results.settings for run in results.cell(setting, task)]
     figure = known(runs[0], _PAPER[metric])
-    if scale.furthest >= PAPER_FRAMES and np.isfinite(figure):
+    if max(run.frames for run in runs) >= PAPER_FRAMES and np.isfinite(figure):
         yield figure, "--"
 
 

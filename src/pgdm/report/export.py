@@ -15,6 +15,15 @@ from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
 from pgdm.report.tables import THRESHOLDS, Average, TaskRow
 
+FILES = (
+    "runs.csv",
+    "tasks.csv",
+    "averages.csv",
+    "statistics.csv",
+    "profiles.csv",
+    "curves.csv",
+)
+
 Aggregates = dict[Setting, tuple[Estimate, list[Estimate], int, int]]
 Improvements = dict[tuple[Setting, Setting], tuple[Estimate, int]]
 

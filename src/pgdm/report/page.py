@@ -20,7 +20,7 @@ from pgdm.errors import RunError
 from pgdm.report import export, figures, tables
 from pgdm.report.curves import curves
 from pgdm.report.results import Results, paper
-from pgdm.report.runs import ERROR, SUCCESS, Run
+from pgdm.report.runs import ERROR, SUCCESS
 from pgdm.report.source import Found, Progress, find
 from pgdm.report.statistics import DRAWS, Estimate
 
@@ -77,6 +77,7 @@ def _context(
     export.averages(results, [row for rows in averages.values() for row in rows], out)
     export.statistics(results, aggregates, better, out)
     export.curves(results, out)
+    pictures = _pictures(results, averages["baseline"], aggregates, out, progress)
     return {
         "results": results,
         "places": places,
@@ -90,7 +91,7 @@ def _context(
         "aggregates": aggregates,
         "better": better,
         "null": paper()["null_policy"],
-        "pictures": _pictures(results, averages["baseline"], aggregates, out, progress),
+        "pictures": pictures,
         "films": _films(results, out, progress),
         "provenance": _provenance(results),
         "commands": _commands(results),
@@ -99,7 +100,7 @@ def _context(
         "folders": {run.path: os.path.relpath(run.path, out.absolute()) for run in results.runs},
         "paper_frames": PAPER_FRAMES,
         "draws": DRAWS,
-        "files": sorted(p.name for p in out.iterdir() if p.suffix in (".csv", ".png")),
+        "files": [*export.FILES, *(f"{name}.png" for name in pictures)],
     }
 
 
@@ -192,7 +193,6 @@ def _render(context: dict[str, Any]) -> str:
         "radians": lambda value: _shown(value, ".2f"),
         "between": _between,
         "frames": _frames,
-        "reason": _reason,
     }
     return environment.get_template("page.html").render(context)
 
@@ -212,15 +212,5 @@ def _frames(count: int) -> str:
     return f"{count / 1e6:.3g}M" if count >= 1_000_000 else f"{count:,}"
 
 
-def _reason(run: Run) -> str:
-    """Return why a run has no result, in a few words."""
-    return str(run.result.get("error", ""))
-
-
 def _data(picture: bytes, kind: str = "png") -> str:
     return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
-
-
-def states_text(counts: dict[str, int]) -> str:
-    """Return how many runs are in each state, in words."""
-    return ", ".join(f"{count} {state}" for state, count in counts.items())

@@ -89,10 +89,10 @@ def _planned(root: Path, found: Found) -> Iterator[RunFolder]:
     for file in sorted(root.rglob(PLAN)):
         plan = read_json(file)
         found.commands += [str(plan["command"])] if plan.get("command") else []
-        for job in plan.get("jobs", []):
-            folder = RunFolder(file.parent / job["config"]["run_dir"])
+        for config in (job["config"] for job in plan.get("jobs", []) if "config" in job):
+            folder = RunFolder(file.parent / config["run_dir"])
             if not (folder.path / CONFIG).exists():
-                folder.config = job["config"]
+                folder.config = config
             yield folder
 
 
