@@ -30,7 +30,8 @@ FLOORS: list[set[str]] = [
     {"make"},  # environments by task id
     {"pgdm"},  # the package's own __init__: what `import pgdm` offers
     {"sweep"},
-    {"cli", "report", "realworld"},
+    {"report"},
+    {"cli", "realworld"},
     {"hydra_plugins"},
 ]
 BASE = FLOORS[0] | FLOORS[1]
