@@ -42,16 +42,16 @@ def intervals(results: Results, estimates: dict[Setting, Estimate], name: str) -
 
 def profiles(results: Results, found: dict[Setting, list[Estimate]]) -> Figure:
     """Draw performance profiles with their bands."""
-    figure, axes = _plain(3.2)
+    figure, axes = _plain(3.0 + 0.18 * len(found))
     for setting, estimates in found.items():
         value, low, high = np.array(estimates).T
         shade = colour(results, setting)
-        axes.plot(THRESHOLDS, value, color=shade, lw=1.8, label=_wrapped(results.labels[setting]))
+        axes.plot(THRESHOLDS, value, color=shade, lw=1.8, label=results.labels[setting])
         axes.fill_between(THRESHOLDS, low, high, color=shade, alpha=0.18, lw=0)
     axes.set(xlim=(0, 1), ylim=(0, 1.02))
     axes.set_xlabel("success of more than", fontsize=9)
     axes.set_ylabel("share of runs", fontsize=9)
-    axes.legend(fontsize=7, frameon=False)
+    figure.legend(loc="outside lower left", fontsize=8, frameon=False)
     return figure
 
 
