@@ -21,12 +21,14 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from datetime import date
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from pgdm.cli import main as pgdm
 from pgdm.config.store import compose
 from pgdm.experiment import run_experiment
+from pgdm.rl.callback import Callback, Progress
 from pgdm.sweep.ledger import Ending, Ledger
 from pgdm.sweep.plan import Job, Plan, job_key, write_plan
 from pgdm.sweep.processes import Process
@@ -135,6 +137,17 @@ def timed_mlflow(spent: dict[str, float]) -> Iterator[None]:
             setattr(MlflowTracker, name, method)
 
 
+class Clock(Callback):
+    """Notes the processor time after each iteration."""
+
+    def __init__(self) -> None:
+        self.ticks: list[float] = []
+
+    def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
+        """Note it."""
+        self.ticks.append(time.process_time())
+
+
 def mlflow_costs(task: str, folder: Path) -> dict[str, float]:
     """Train for a few iterations, mirrored to MLflow, and return what that costs."""
     steps = 64 * 64
@@ -153,15 +166,14 @@ def mlflow_costs(task: str, folder: Path) -> dict[str, float]:
         ]
     )
     spent: dict[str, float] = {}
+    clock = Clock()
     with timed_mlflow(spent):
-        run_experiment(cfg, notify=lambda text: None)
-    lines = [r for r in RunLog(folder / "run" / "metrics.jsonl").read() if r["kind"] == "train"]
-    rates = [float(line["train/steps_per_s"]) for line in lines[1:]]
-    iteration_s = steps / statistics.median(rates)
+        run_experiment(cfg, [clock], notify=lambda text: None)
+    iteration_s = statistics.median(b - a for a, b in pairwise(clock.ticks))
     once_s = spent["_connected"] + spent["_end"]  # import, connect, copy files
-    each_s = (spent["_flush"] - spent["_connected"]) / len(lines)
+    each_s = (spent["_flush"] - spent["_connected"]) / ITERATIONS
     return {
-        "iteration_s": iteration_s,
+        "iteration_cpu_s": iteration_s,
         "mlflow_cpu_s_per_iteration": each_s,
         "mlflow_cpu_s_once": once_s,
         "mlflow_share": each_s / iteration_s + once_s / (FRAMES / steps * iteration_s),
