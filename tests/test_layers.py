@@ -29,7 +29,9 @@ FLOORS: list[set[str]] = [
     {"experiment"},
     {"make"},  # environments by task id
     {"pgdm"},  # the package's own __init__: what `import pgdm` offers
-    {"cli", "sweep", "report", "realworld", "hydra_plugins"},
+    {"sweep"},
+    {"cli", "report", "realworld"},
+    {"hydra_plugins"},
 ]
 BASE = FLOORS[0] | FLOORS[1]
 

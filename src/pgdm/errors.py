@@ -65,5 +65,9 @@ class RunError(PgdmError):
     """A run folder cannot be used, or a run failed."""
 
 
+class SweepError(PgdmError):
+    """A sweep's folder cannot be used, or what was asked does not fit what is in it."""
+
+
 class TrackingError(PgdmError):
     """A tracker could not be reached or refused a record."""

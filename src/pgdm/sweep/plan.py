@@ -1,0 +1,138 @@
+"""What a sweep is to do: its jobs, each a checked experiment with an identity and a folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pgdm.config.identity import identity
+from pgdm.config.schema import ExperimentCfg
+from pgdm.config.strict import build
+from pgdm.errors import SweepError
+
+FILE = "plan.json"
+"""The plan in the folder of its sweep."""
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class SweepCfg:
+    """How a sweep is named, kept and driven."""
+
+    name: str | None
+    """Name of the sweep and of its folder; None makes one from the settings."""
+    dir: str | None
+    """Folder of the sweep; None is ``runs/sweeps/<name>``."""
+    max_attempts: int
+    """How often a job may be started before it counts as failed for good."""
+    detach: bool
+    """Go on in the background, and return at once."""
+    dry_run: bool
+    """Print the plan, and start nothing."""
+
+
+@dataclass(frozen=True)
+class LocalCfg:
+    """How many jobs run side by side on this machine."""
+
+    name: str
+    """Which launcher this is: ``local``."""
+    max_jobs: int
+    """Most jobs at a time; 0 is as many as cores and memory allow."""
+    cores_per_job: int
+    """Threads of each job; 0 divides the cores by the jobs."""
+    memory_per_job_gb: float
+    """Memory to reckon with for each job [GB]."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One experiment of a sweep."""
+
+    key: str
+    """16 hex digits that follow from everything that changes the result."""
+    name: str
+    """What tells it from the others, such as ``task=cup-pour1 seed=1``."""
+    overrides: tuple[str, ...]
+    """All of its overrides, enough to make it again."""
+    cfg: ExperimentCfg
+    """The experiment; ``cfg.run_dir`` is its own folder, absolute."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A sweep before it starts."""
+
+    name: str
+    """Name of the sweep."""
+    folder: Path
+    """Folder of the sweep, absolute: ``plan.json``, ``ledger.sqlite``, ``logs/``, and its runs."""
+    jobs: tuple[Job, ...]
+    """What is to be done; no two have the same key."""
+    command: str
+    """What was typed."""
+
+
+def job_key(cfg: ExperimentCfg) -> str:
+    """Return 16 hex digits that two experiments share if they come to the same result."""
+    # The length belongs to a result, though a longer run may go on in a shorter one's folder.
+    whole = identity(cfg) | {"total_frames": cfg.total_frames}
+    return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def write_plan(plan: Plan) -> None:
+    """Write ``plan.json`` into the folder of the sweep, whole or not at all."""
+    jobs = [
+        {
+            "key": job.key,
+            "name": job.name,
+            "overrides": list(job.overrides),
+            "config": dataclasses.asdict(job.cfg) | {"run_dir": _shown(job.cfg.run_dir, plan)},
+        }
+        for job in plan.jobs
+    ]
+    whole = {"format": FORMAT, "name": plan.name, "command": plan.command, "jobs": jobs}
+    plan.folder.mkdir(parents=True, exist_ok=True)
+    fresh = plan.folder / f".{FILE}.fresh"
+    fresh.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+    fresh.replace(plan.folder / FILE)
+
+
+def _shown(run_dir: str, plan: Plan) -> str:
+    """Return a run's folder as the file names it, so that a sweep may be moved as a whole."""
+    path = Path(run_dir)
+    return str(path.relative_to(plan.folder) if path.is_relative_to(plan.folder) else path)
+
+
+def read_plan(folder: Path) -> Plan:
+    """Read the plan of a sweep.
+
+    Raises:
+        SweepError: if the folder holds no sweep, or its plan is damaged.
+        ConfigError: if a job's settings are not those of this version.
+    """
+    folder = folder.absolute()
+    file = folder / FILE
+    try:
+        whole = json.loads(file.read_text(encoding="utf-8"))
+        known = whole["format"] == FORMAT
+        jobs = tuple(_job(entry, folder) for entry in whole["jobs"]) if known else ()
+        plan = Plan(whole["name"], folder, jobs, whole["command"])
+    except FileNotFoundError as error:
+        raise SweepError(f"'{folder}' holds no sweep: it has no {FILE}") from error
+    except (ValueError, LookupError, TypeError) as error:
+        raise SweepError(f"{file} is damaged ({error}); remove it to plan anew") from error
+    if not known:
+        raise SweepError(f"{file} is of another version of pgdm; use that, or another sweep.name")
+    return plan
+
+
+def _job(entry: Mapping[str, Any], folder: Path) -> Job:
+    config = dict(entry["config"])
+    cfg = build(ExperimentCfg, config | {"run_dir": str(folder / config["run_dir"])})
+    return Job(entry["key"], entry["name"], tuple(entry["overrides"]), cfg)
