@@ -21,6 +21,7 @@ from yaml import YAMLError
 
 from pgdm.config.groups import available, conf_dir, groups
 from pgdm.config.strict import build, flatten
+from pgdm.config.suites import suite, suites
 from pgdm.errors import ConfigError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -65,8 +66,9 @@ def from_dict_config(composed: DictConfig) -> ExperimentCfg:
     data = {str(key): value for key, value in plain.items()}
     chosen = data.get("run_dir")
     given = {"run_dir": "." if chosen is None else chosen}
-    if data.get("budget") is None:
+    if data.get("budget") == "paper":
         given["budget"] = _budget(data.get("total_frames"))
+    data.pop("sweep", None)  # of the command, not of a run
     cfg = build(ExperimentCfg, data | given)
     cfg.validate()
     check_device(cfg.device)
@@ -74,6 +76,7 @@ def from_dict_config(composed: DictConfig) -> ExperimentCfg:
 
 
 def _budget(total_frames: object) -> str:
+    """Return the true label: a shorter run is not to be set beside the paper's."""
     whole = isinstance(total_frames, int) and total_frames >= PAPER_FRAMES
     return "paper" if whole else "reduced"
 
@@ -196,9 +199,23 @@ def _explain_text(text: str) -> ConfigError:
 
 def _explain_missing(error: MissingConfigException, text: str) -> ConfigError:
     group, _, option = (error.missing_cfg_file or "").rpartition("/")
+    if group == "task" and error.options:
+        return _explain_task(option, error.options)
     if group and error.options:
         return UnknownNameError(group, option, [o for o in error.options if o[0] != "_"])
     return ConfigError(text)
+
+
+def _explain_task(name: str, tasks: Sequence[str]) -> ConfigError:
+    if name in suites():
+        size = len(suite(name))
+        return ConfigError(
+            f"{name} is a suite of {size} tasks; to run them all: pgdm-run -m task={name}"
+        )
+    if "*" in name:
+        return ConfigError(f"several tasks are a sweep; to run them all: pgdm-run -m task={name}")
+    known = [task for task in tasks if task[0] != "_"]
+    return UnknownNameError("task", name, [*known, *suites()])
 
 
 def _known_names() -> list[str]:

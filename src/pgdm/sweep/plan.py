@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pgdm.config.identity import identity
+from pgdm.config.identity import difference, identity
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.strict import build
-from pgdm.errors import SweepError
+from pgdm.errors import ConfigError, SweepError
+from pgdm.tracking.run_folder import write_json
 
 FILE = "plan.json"
 """The plan in the folder of its sweep."""
@@ -85,6 +86,40 @@ def job_key(cfg: ExperimentCfg) -> str:
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 
 
+def record(plan: Plan) -> None:
+    """Write ``plan.json`` with the jobs of a plan beside those that it has already.
+
+    Raises:
+        SweepError: as ``check_fits``.
+    """
+    keys = {job.key for job in plan.jobs}
+    others = tuple(job for job in check_fits(plan) if job.key not in keys)
+    write_plan(dataclasses.replace(plan, jobs=(*others, *plan.jobs)))
+
+
+def check_fits(plan: Plan) -> tuple[Job, ...]:
+    """Return the jobs that the folder of a plan has already; none of them may have changed.
+
+    Raises:
+        SweepError: if a job of the same name had other settings; the message is the difference.
+    """
+    if not (plan.folder / FILE).exists():
+        return ()
+    known = read_plan(plan.folder).jobs
+    before = {job.name: job for job in known}
+    changed = [(before[j.name], j) for j in plan.jobs if j.key != before.get(j.name, j).key]
+    if changed:
+        (old, new), others = changed[0], len(changed) - 1
+        whole = [("total_frames", old.cfg.total_frames, new.cfg.total_frames)]
+        changes = difference(old.cfg, new.cfg) + [f"{k}: {a} -> {b}" for k, a, b in whole if a != b]
+        raise SweepError(
+            f"sweep '{plan.name}' in '{plan.folder}' was made with other settings ({new.name}: "
+            f"{'; '.join(changes)}{f'; so do {others} other jobs' if others else ''}); choose "
+            "another sweep.name, or the settings it was made with"
+        )
+    return known
+
+
 def write_plan(plan: Plan) -> None:
     """Write ``plan.json`` into the folder of the sweep, whole or not at all."""
     jobs = [
@@ -98,9 +133,7 @@ def write_plan(plan: Plan) -> None:
     ]
     whole = {"format": FORMAT, "name": plan.name, "command": plan.command, "jobs": jobs}
     plan.folder.mkdir(parents=True, exist_ok=True)
-    fresh = plan.folder / f".{FILE}.fresh"
-    fresh.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
-    fresh.replace(plan.folder / FILE)
+    write_json(plan.folder / FILE, whole)
 
 
 def _shown(run_dir: str, plan: Plan) -> str:
@@ -113,8 +146,7 @@ def read_plan(folder: Path) -> Plan:
     """Read the plan of a sweep.
 
     Raises:
-        SweepError: if the folder holds no sweep, or its plan is damaged.
-        ConfigError: if a job's settings are not those of this version.
+        SweepError: if the folder holds no sweep, or its plan is damaged or of another version.
     """
     folder = folder.absolute()
     file = folder / FILE
@@ -125,10 +157,14 @@ def read_plan(folder: Path) -> Plan:
         plan = Plan(whole["name"], folder, jobs, whole["command"])
     except FileNotFoundError as error:
         raise SweepError(f"'{folder}' holds no sweep: it has no {FILE}") from error
+    except ConfigError as error:
+        raise SweepError(
+            f"{file} was made by a pgdm with other settings ({error}); choose another sweep.name"
+        ) from error
     except (ValueError, LookupError, TypeError) as error:
         raise SweepError(f"{file} is damaged ({error}); remove it to plan anew") from error
     if not known:
-        raise SweepError(f"{file} is of another version of pgdm; use that, or another sweep.name")
+        raise SweepError(f"{file} has a format of another pgdm; choose another sweep.name")
     return plan
 
 
