@@ -20,13 +20,14 @@ class PgdmSweeper(Sweeper):
     """
 
     def __init__(self, params: Mapping[str, Any]) -> None:
-        self.params = params
+        self._given = [f"{key}={value}" for key, value in params.items()]
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
         """Take what Hydra has made of the command line so far."""
-        self.hydra_context, self.task_function, self.config = hydra_context, task_function, config
+        self._loader, self._whole = hydra_context.config_loader, config
+        self._task_function = task_function
 
     def sweep(self, arguments: list[str]) -> list[Any]:
         """Expand the arguments, compose each job, and return what the task function returned."""
@@ -35,12 +36,10 @@ class PgdmSweeper(Sweeper):
 
         from pgdm.sweep.expand import composed_jobs
 
-        given = [f"{key}={value}" for key, value in self.params.items()]
-        loader = self.hydra_context.config_loader
-        HydraConfig.instance().set_config(self.config)
+        HydraConfig.instance().set_config(self._whole)
         results = []
-        for overrides, job in list(composed_jobs(loader, self.config, [*given, *arguments])):
-            with read_write(HydraConfig.get()):
+        for overrides, job in composed_jobs(self._loader, self._whole, [*self._given, *arguments]):
+            with read_write(self._whole.hydra):
                 HydraConfig.get().overrides.task = list(overrides)
-            results.append(self.task_function(job))
+            results.append(self._task_function(job))
         return results

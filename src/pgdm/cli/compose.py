@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pgdm.cli.flags import Flags
-from pgdm.errors import ConfigError
+from pgdm.errors import ConfigError, UnknownNameError
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -27,8 +27,10 @@ class Composed:
     jobs: list[tuple[tuple[str, ...], DictConfig]] = field(default_factory=list)
     """Overrides and settings of each; none if Hydra only printed something."""
     is_sweep: bool = False
-    launcher: dict[str, Any] = field(default_factory=dict)
-    """What starts the jobs of a sweep."""
+    launcher_choice: str = ""
+    """Which one starts the jobs of a sweep."""
+    launcher: Any = None
+    """Its settings, as plain data."""
 
 
 def compose_all(flags: Flags) -> Composed:
@@ -47,6 +49,10 @@ def compose_all(flags: Flags) -> Composed:
     if flags.config_dir is not None and not Path(flags.config_dir).is_dir():
         raise ConfigError(f"--config-dir '{flags.config_dir}' is not a folder")
     check_overrides(flags.overrides)
+    for override in flags.overrides:
+        key, _, value = override.partition("=")
+        if key == "hydra/sweeper" and value != "pgdm":
+            raise UnknownNameError("hydra/sweeper of pgdm", value, ["pgdm"])
     found = Composed()
 
     def collect(composed: DictConfig) -> None:
@@ -56,19 +62,19 @@ def compose_all(flags: Flags) -> Composed:
         found.jobs.append((tuple(own.overrides.task), composed))
         if len(found.jobs) == 1:
             found.is_sweep = own.mode == RunMode.MULTIRUN
-            launcher: Any = OmegaConf.to_container(own.launcher)
-            found.launcher = {"choice": own.runtime.choices["hydra/launcher"]} | launcher
+            found.launcher = OmegaConf.to_container(own.launcher)
+            found.launcher_choice = str(own.runtime.choices["hydra/launcher"])
 
     app = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(collect)
     with _hydra_command_line(flags):
         try:
             app()
         except COMPOSITION_ERRORS as error:
-            raise explain(error, flags.overrides) from error
-    if not found.is_sweep:
-        for override in flags.overrides:
-            if override.startswith(_OF_SWEEPS):
-                raise ConfigError(f"'{override}' is for sweeps; add -m, or leave it out")
+            raise explain(error, flags.overrides, flags.config_dir) from error
+    stray = [override for override in flags.overrides if override.startswith(_OF_SWEEPS)]
+    if stray and found.jobs and not found.is_sweep:
+        shown = "--dry-run" if "--dry-run" in flags.ours else stray[0]
+        raise ConfigError(f"'{shown}' is for sweeps; add -m, or leave it out")
     return found
 
 

@@ -13,7 +13,7 @@ from pgdm.cli.compose import Composed
 from pgdm.cli.errors import EXPECTED, report
 from pgdm.cli.train import notify, train
 from pgdm.config.strict import build
-from pgdm.errors import UnknownNameError
+from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.sweep.estimate import Estimate, estimate
 from pgdm.sweep.plan import LocalCfg, Plan, SweepCfg, check_fits, record
 from pgdm.sweep.planning import make_plan
@@ -36,10 +36,7 @@ def run_planned(composed: Composed, name: str, command: str, debug: bool) -> int
         PgdmError: if a job's settings are wrong, or the sweep's folder holds another sweep.
     """
     sweep = build(SweepCfg, composed.jobs[0][1].sweep, "sweep")
-    chosen = composed.launcher.pop("choice")
-    if chosen not in _LAUNCHERS:
-        raise UnknownNameError("hydra/launcher of pgdm", chosen, _LAUNCHERS)
-    launcher = build(LocalCfg, composed.launcher, "hydra.launcher")
+    launcher = _launcher(composed)
     plan, notes = make_plan(composed.jobs, sweep, name, command)
     check_fits(plan)
     for note in [*notes[:_MOST_NOTES], *(["..."] if len(notes) > _MOST_NOTES else [])]:
@@ -50,6 +47,18 @@ def run_planned(composed: Composed, name: str, command: str, debug: bool) -> int
         return 0
     record(plan)
     return _run(plan, sweep, launcher, debug)
+
+
+def _launcher(composed: Composed) -> LocalCfg:
+    if composed.launcher_choice not in _LAUNCHERS:
+        raise UnknownNameError("hydra/launcher of pgdm", composed.launcher_choice, _LAUNCHERS)
+    launcher = build(LocalCfg, composed.launcher, "hydra.launcher")
+    for key in ("max_jobs", "cores_per_job"):
+        if (value := getattr(launcher, key)) < 0:
+            raise ConfigError(f"hydra.launcher.{key} is {value}; it must be at least 0")
+    if (memory := launcher.memory_per_job_gb) <= 0:
+        raise ConfigError(f"hydra.launcher.memory_per_job_gb is {memory}; it must be above 0")
+    return launcher
 
 
 def _run(plan: Plan, sweep: SweepCfg, launcher: LocalCfg, debug: bool) -> int:

@@ -118,7 +118,7 @@ def _composed(overrides: Sequence[str], folder: str | None = None) -> DictConfig
         with _LOCK, _own_hydra(), hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
             return hydra.compose("config", overrides=[*search, *overrides])
     except COMPOSITION_ERRORS as error:
-        raise explain(error, overrides) from error
+        raise explain(error, overrides, folder) from error
 
 
 def check_overrides(overrides: Sequence[str]) -> None:
@@ -131,6 +131,8 @@ def check_overrides(overrides: Sequence[str]) -> None:
         key, _, value = override.partition("=")
         if not key.strip("+~"):
             raise ConfigError(f"cannot read '{override}'; write key=value, such as seed=3")
+        if key == "suite":
+            raise ConfigError(f"a suite is named by its tasks: pgdm-run -m task={value}")
         if value.startswith("[") and key in groups():
             # Hydra would merge the options, so that the last one wins.
             raise ConfigError(
@@ -155,12 +157,15 @@ def _quoted(text: str) -> str:
     return f"'{escaped}'"
 
 
-def explain(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
+def explain(
+    error: Exception, overrides: Sequence[str] = (), config_dir: str | None = None
+) -> ConfigError:
     """Return what an error of COMPOSITION_ERRORS means for a user, as one line.
 
     Args:
         error: what Hydra, OmegaConf or the YAML reader raised.
         overrides: what the user gave.
+        config_dir: the user's own settings folder.
     """
     text = " ".join(str(error).split())
     if isinstance(error, MissingMandatoryValue):
@@ -169,7 +174,7 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
     for tail in (" full_key:", " Config search path:", " object_type="):
         text = text.partition(tail)[0]
     if isinstance(error, MissingConfigException):
-        return _explain_missing(error, text)
+        return _explain_missing(error, text, config_dir)
     if isinstance(error, OverrideParseException):
         return ConfigError(f"cannot read '{error.override}'; write key=value, such as seed=3")
     if isinstance(error, YAMLError):
@@ -197,25 +202,27 @@ def _explain_text(text: str) -> ConfigError:
     return ConfigError(text)
 
 
-def _explain_missing(error: MissingConfigException, text: str) -> ConfigError:
+def _explain_missing(
+    error: MissingConfigException, text: str, config_dir: str | None
+) -> ConfigError:
     group, _, option = (error.missing_cfg_file or "").rpartition("/")
     if group == "task" and error.options:
-        return _explain_task(option, error.options)
+        return _explain_task(option, error.options, config_dir)
     if group and error.options:
         return UnknownNameError(group, option, [o for o in error.options if o[0] != "_"])
     return ConfigError(text)
 
 
-def _explain_task(name: str, tasks: Sequence[str]) -> ConfigError:
-    if name in suites():
-        size = len(suite(name))
+def _explain_task(name: str, tasks: Sequence[str], config_dir: str | None) -> ConfigError:
+    if name in suites(config_dir):
+        size = len(suite(name, config_dir))
         return ConfigError(
             f"{name} is a suite of {size} tasks; to run them all: pgdm-run -m task={name}"
         )
     if "*" in name:
         return ConfigError(f"several tasks are a sweep; to run them all: pgdm-run -m task={name}")
     known = [task for task in tasks if task[0] != "_"]
-    return UnknownNameError("task", name, [*known, *suites()])
+    return UnknownNameError("task", name, [*known, *suites(config_dir)])
 
 
 def _known_names() -> list[str]:

@@ -105,11 +105,11 @@ class _Expansion:
 def task_facts(file: Path) -> dict[str, Any]:
     """Return what the file of a task itself says, with the hand that plays it as ``hand``."""
     content = _read(file)
-    entries = content.pop("defaults", None) or []
-    chosen = [
-        (str(key), option) for e in entries if isinstance(e, dict) for key, option in e.items()
-    ]
-    return content | {"hand": option for key, option in chosen if "/hand" in key}
+    for entry in content.pop("defaults", None) or []:
+        for key, option in entry.items() if isinstance(entry, dict) else ():
+            if "/hand" in str(key):
+                content["hand"] = option
+    return content
 
 
 def _read(file: Path) -> dict[str, Any]:

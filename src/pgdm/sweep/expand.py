@@ -5,15 +5,16 @@ from __future__ import annotations
 import copy
 import itertools
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.defaults_list import create_defaults_list
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf
 
 from pgdm.config.suites import expand_tasks
 from pgdm.errors import ConfigError
@@ -27,7 +28,7 @@ def with_tasks_as_choices(overrides: Sequence[str]) -> list[str]:
 
     Hydra composes single values before any sweeper sees them, and no option has a suite's name.
     """
-    plain = re.compile(r"task=([^,()]+)")
+    plain = re.compile(r"task=(?!null$)([^,()]+)")
     return [plain.sub(r"task=choice(\1)", o) if plain.fullmatch(o) else o for o in overrides]
 
 
@@ -65,8 +66,12 @@ def _values(override: Override, tasks: Tasks) -> Sequence[str]:
 
 def composed_jobs(
     loader: ConfigLoader, config: DictConfig, arguments: Sequence[str]
-) -> Iterator[tuple[tuple[str, ...], DictConfig]]:
-    """Yield the overrides of each job, and its settings without Hydra's own.
+) -> list[tuple[tuple[str, ...], DictConfig]]:
+    """Return the overrides of each job, and its settings without Hydra's own.
+
+    ``load_sweep_config`` would do, but reads every file anew for every job, those of Hydra itself
+    included. These are its steps; the files are read once, and jobs that differ in single keys,
+    such as seed, share what their choices of files give.
 
     Args:
         loader: the running application's.
@@ -77,30 +82,43 @@ def composed_jobs(
         ConfigError: if a value is not what ``grid`` takes.
         HydraException: if the settings of a job are wrong.
     """
+    assert isinstance(loader, ConfigLoaderImpl)
+    name = config.hydra.job.config_name
+    searched = [*config.hydra.overrides.hydra, *arguments]  # hydra.searchpath may be among them
+    _, repository = loader._parse_overrides_and_create_caching_repo(name, searched)
     parser = OverridesParser.create(config_loader=loader)
+    parse = cache(parser.parse_override)
+
+    @cache
+    def chosen(*texts: str) -> DictConfig:
+        found = create_defaults_list(
+            repo=repository,
+            config_name=name,
+            overrides_list=[parse(text) for text in texts],
+            prepend_hydra=True,
+            skip_missing=False,
+        )
+        own = [default for default in found.defaults if not _is_hydras(default.config_path)]
+        settings = loader._compose_config_from_defaults_list(defaults=own, repo=repository)
+        del settings["hydra"]
+        OmegaConf.set_struct(settings, True)
+        return settings
 
     def tasks(words: Sequence[str]) -> Sequence[str]:
         return expand_tasks(words, _own_folder(config))
 
-    # Composing takes Hydra tens of milliseconds. Jobs that differ in single keys, such as seed,
-    # therefore share it: the keys are set afterwards, which is Hydra's own order too.
-    parse = cache(lambda text: parser.parse_override(text))
-    is_choice = cache(lambda key: bool(loader.get_group_options(key)))
-    compose = cache(lambda *chosen: _without_hydra(loader.load_sweep_config(config, list(chosen))))
+    jobs = []
     for job in grid(parser.parse_overrides(list(arguments)), tasks):
-        parts = {text: parse(text) for text in job}
-        settings = copy.deepcopy(
-            compose(*(text for text, part in parts.items() if is_choice(part.key_or_group)))
-        )
-        rest = [part for part in parts.values() if not is_choice(part.key_or_group)]
-        ConfigLoaderImpl._apply_overrides_to_config(rest, settings)
-        yield job, settings
+        choices = [text for text in job if repository.group_exists(parse(text).key_or_group)]
+        settings = copy.deepcopy(chosen(*choices))
+        keys = [parse(text) for text in job if text not in choices]
+        ConfigLoaderImpl._apply_overrides_to_config(keys, settings)
+        jobs.append((job, settings))
+    return jobs
 
 
-def _without_hydra(settings: DictConfig) -> DictConfig:
-    with open_dict(settings):
-        del settings["hydra"]
-    return settings
+def _is_hydras(path: str | None) -> bool:
+    return path is not None and path.startswith("hydra/")
 
 
 def _own_folder(config: DictConfig) -> Path | None:

@@ -7,7 +7,8 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig, OmegaConf
 
 from pgdm import paths
 from pgdm.config.identity import default_run_dir
@@ -17,11 +18,9 @@ from pgdm.errors import ConfigError
 from pgdm.sweep.plan import Job, Plan, SweepCfg, job_key
 from pgdm.sweep.studies import NOT_IN_A_NAME
 
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
-Composed = tuple[tuple[str, ...], "DictConfig"]
+Composed = tuple[tuple[str, ...], DictConfig]
 """Overrides of a job, and the settings that they lead to."""
+
 
 def make_plan(
     composed: Sequence[Composed], sweep: SweepCfg, name: str, command: str
@@ -40,6 +39,8 @@ def make_plan(
     name = name if sweep.name is None else sweep.name
     if not re.fullmatch(r"\w[\w.+-]*", name):
         raise ConfigError(f"sweep.name '{name}' is no name for a folder; use letters, digits, _.+-")
+    if sweep.max_attempts < 1:
+        raise ConfigError(f"sweep.max_attempts is {sweep.max_attempts}; it must be at least 1")
     folder = (paths.runs() / "sweeps" / name if sweep.dir is None else Path(sweep.dir)).absolute()
     jobs: dict[str, Job] = {}
     notes = []
@@ -47,8 +48,8 @@ def make_plan(
         cfg = _placed(_checked(settings, job_name), folder)
         job = Job(job_key(cfg), job_name, overrides, cfg)
         if job.key in jobs:
-            same = jobs[job.key].name
-            notes.append(f"{job_name} would repeat {same}, and is left out")
+            same = " ".join(jobs[job.key].overrides)
+            notes.append(f"'{' '.join(overrides)}' would repeat '{same}', and is left out")
         else:
             jobs[job.key] = job
     _check_folders(list(jobs.values()))
@@ -66,9 +67,13 @@ def _names(composed: Sequence[Composed]) -> list[str]:
     others = [key for key in varied if key.partition(".")[0] not in NOT_IN_A_NAME]
     names = []
     for one, (_, settings) in zip(given, composed, strict=True):
-        task, seed = one.get("task", settings.task.id), one.get("seed", settings.seed)
-        told = [("task", task), *((k, one[k]) for k in others if k in one), ("seed", seed)]
-        names.append(" ".join(f"{key}={value}" for key, value in told))
+        # Not yet checked: there may be neither.
+        ends = {
+            "task": OmegaConf.select(settings, "task.id"),
+            "seed": OmegaConf.select(settings, "seed"),
+        } | one
+        keys = ["task", *(key for key in others if key in one), "seed"]
+        names.append(" ".join(f"{key}={ends[key]}" for key in keys))
     return names
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import yaml
 
-import pgdm.config.groups as groups
+from pgdm.config.groups import conf_dir, folders
 from pgdm.errors import ConfigError, UnknownNameError
 
 _KEY = "+sweep"
@@ -24,8 +24,8 @@ NOT_IN_A_NAME = (
 def studies(config_dir: str | Path | None = None) -> dict[str, Path]:
     """Return the names of the sweep files, each with its file; a name of pgdm's stays pgdm's."""
     # In a checkout they lie beside conf/, in an installed package as well.
-    folders = [groups.conf_dir().parent, *groups.folders(config_dir)[1:]]
-    own_last = [file for folder in folders for file in (folder / "sweeps").glob("*.yaml")]
+    places = [conf_dir().parent, *folders(config_dir)[1:]]
+    own_last = [file for folder in places for file in (folder / "sweeps").glob("*.yaml")]
     return dict(sorted((file.stem, file) for file in reversed(own_last)))
 
 
