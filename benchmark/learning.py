@@ -21,21 +21,14 @@ from typing import Any
 import matplotlib.pyplot as plt
 
 from pgdm.config.saved import load_config
+from pgdm.config.suites import suite
 from pgdm.tracking.run_folder import read_json
 from pgdm.tracking.run_log import RunLog
 
 RESULTS = Path(__file__).parent / "results" / "learning"
 FRAMES = 1_000_000
 
-# quick6: a tool, a hard pour, a lift, one task of each other hand, and one without mocap.
-QUICK6 = (
-    "hammer-use1",
-    "cup-pour1",
-    "spheremedium-lift",
-    "dhand-cup",
-    "dmanus-crackerbox",
-    "door-open",
-)
+QUICK6 = suite("quick6")
 SETTINGS = {
     "ppo_fast-residual": ("algo=ppo_fast", "action=residual"),
     "ppo-absolute": ("algo=ppo", "action=absolute"),

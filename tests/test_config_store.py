@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pgdm.config.groups import available, conf_dir, groups
+from pgdm.config.identity import identity_hash
 from pgdm.config.store import compose
 from pgdm.errors import ConfigError, UnknownNameError
 
@@ -49,6 +50,31 @@ def test_every_option_composes(group: str, option: str) -> None:
 def test_every_named_experiment_composes_and_can_be_changed(name: str) -> None:
     cfg = compose([f"+experiment={name}", "task=cup-pour1", "seed=5"])
     assert (cfg.task.id, cfg.seed) == ("cup-pour1", 5)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "frames", "label"),
+    [
+        ([], 50_000_000, "paper"),
+        (["budget=paper", "total_frames=200_000"], 200_000, "reduced"),
+        (["budget=reduced"], 1_000_000, "reduced"),
+        (["budget=smoke"], 8192, "smoke"),
+        (["budget=smoke", "total_frames=100_000_000"], 100_000_000, "smoke"),
+        (["+experiment=quickstart"], 450_560, "reduced"),
+        (["+experiment=quickstart", "budget=smoke"], 8192, "smoke"),
+        (["+experiment=quickstart", "budget=paper"], 50_000_000, "paper"),
+    ],
+)
+def test_a_budget_is_a_length_and_a_true_label(
+    overrides: list[str], frames: int, label: str
+) -> None:
+    cfg = compose(overrides)
+    assert (cfg.total_frames, cfg.budget) == (frames, label)
+
+
+def test_a_budget_changes_nothing_of_what_is_computed() -> None:
+    hashes = {identity_hash(compose([f"budget={name}"])) for name in available("budget")}
+    assert len(hashes) == 1
 
 
 def test_quickstart_is_residual_and_fast() -> None:
@@ -115,7 +141,7 @@ def test_another_hand_than_the_tasks_own() -> None:
         ("seed=???", r"seed has no value yet \(\?\?\?\)"),
         ("~seed", "missing seed"),
         ("seed=null", "seed: null is not allowed"),
-        ("budget=${foo}", "Interpolation key 'foo' not found"),
+        ("device=${foo}", "Interpolation key 'foo' not found"),
         ("total_frames=abc", "total_frames: 'abc' is not an integer"),
         ("num_envs=1.5", "num_envs: 1.5 is not an integer"),
         ("algo.hidden.x=3", "cannot apply algo.hidden.x=3"),

@@ -43,8 +43,8 @@ NARROW: dict[str, set[str]] = {"rl": BASE}
 ALLOWED: dict[str, set[str]] = {
     "mujoco": {"library", "motion", "sim", "pregrasp", "realworld"},
     "torchrl": {"envs.torchrl", "rl"},
-    "hydra": {"config.store", "cli", "hydra_plugins"},
-    "omegaconf": {"config.store", "cli", "hydra_plugins"},
+    "hydra": {"config.store", "sweep.expand", "cli", "hydra_plugins"},
+    "omegaconf": {"config.store", "sweep.expand", "sweep.planning", "cli", "hydra_plugins"},
     "mlflow": {"tracking", "report"},
 }
 

@@ -12,6 +12,9 @@ from pathlib import Path
 import yaml
 
 from pgdm.config.describe import Description, Key, describe
+from pgdm.config.groups import groups
+from pgdm.config.suites import suite, suites
+from pgdm.sweep.studies import studies
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONF = REPOSITORY / "conf"
@@ -54,6 +57,34 @@ def _options(group: str, found: dict[str, Description], default: str | None) -> 
     return [*rows, ""]
 
 
+def _suites() -> list[str]:
+    rows = ["| suite | tasks | what it is |", "|---|--:|---|"]
+    for name, file in suites().items():
+        rows.append(f"| `-m task={name}` | {len(suite(name))} | {_cell(describe(file).title)} |")
+    note = (
+        "With `-m`, `task` takes suites, tasks and patterns, separated by commas; a minus takes "
+        "tasks away: `-m task=tcdm30,dhand-*,-dhand-cup`. A suite of your own is "
+        "`my/suite/NAME.yaml`, with the key `tasks`, a list of the same words."
+    )
+    members = [
+        f"`{name}`: {', '.join(suite(name))}."
+        for name in suites()
+        if "tasks" in yaml.safe_load(suites()[name].read_text(encoding="utf-8"))
+    ]
+    return ["## Suites", "", *rows, "", note, "", *(line for m in members for line in (m, ""))]
+
+
+def _sweeps() -> list[str]:
+    rows = ["| sweep file | what it is |", "|---|---|"]
+    rows += [f"| `+sweep={n}` | {_cell(describe(file).title)} |" for n, file in studies().items()]
+    lines = ["## Sweep files", "", *rows, ""]
+    for file in sorted((CONF / "hydra" / "launcher").glob("*.yaml")):
+        found = describe(file)
+        lines += [f"## hydra/launcher={file.stem}", "", found.title, ""]
+        lines += _table(found.keys, "hydra.launcher")
+    return lines
+
+
 def _group(group: str, default: str | None) -> list[str]:
     files = sorted((CONF / group).glob("[!_]*.yaml"))
     found = {file.stem: describe(file) for file in files}
@@ -63,9 +94,11 @@ def _group(group: str, default: str | None) -> list[str]:
         for name, description in found.items():
             lines += [f"`{name}` is:", "", "```sh", _command(description), "```", ""]
         return lines
-    lines += [f"Keys, with the values of `{main}`:", "", *_table(found[main].keys, group)]
+    # A budget sets keys of the whole and of other groups.
+    prefix = "" if group == "budget" else group
+    lines += [f"Keys, with the values of `{main}`:", "", *_table(found[main].keys, prefix)]
     for name, description in found.items():
-        changed = _changes(description, found[main], group)
+        changed = _changes(description, found[main], prefix)
         if changed:
             lines += [f"`{group}={name}` changes:", "", *_table(changed, "")]
     return lines
@@ -77,14 +110,15 @@ def _command(experiment: Description) -> str:
     return " ".join(["pgdm-run", *choices, *(f"{k.name}={k.value}" for k in experiment.keys)])
 
 
-def _changes(description: Description, main: Description, group: str) -> list[Key]:
+def _changes(description: Description, main: Description, prefix: str) -> list[Key]:
     """Return the keys that differ, named as on the command line, with the main file's comments."""
     known = {key.name: key for key in describe(CONF / "config.yaml").keys}
-    known |= {f"{group}.{key.name}": key for key in main.keys}
+    known |= {f"{prefix}.{key.name}".lstrip("."): key for key in main.keys}
+    known |= {f"eval.{key.name}": key for key in describe(CONF / "eval" / "default.yaml").keys}
     changed = []
     for key in description.keys:
         # A file of package _global_ names its keys in full already.
-        name = key.name if key.name in known else f"{group}.{key.name}"
+        name = key.name if key.name in known else f"{prefix}.{key.name}"
         if key.value != known[name].value:
             changed.append(Key(name, key.value, key.comment or known[name].comment))
     return changed
@@ -121,9 +155,9 @@ def page() -> str:
     """Return the page."""
     config = describe(CONF / "config.yaml")
     lines = [_HEAD, "## What every run has", "", *_table(config.keys, "")]
-    for folder in sorted(p for p in CONF.iterdir() if p.is_dir() and p.name[0] not in "._"):
-        own = folder.name == "task"
-        lines += _tasks() if own else _group(folder.name, config.defaults.get(folder.name))
+    for group in groups():
+        lines += _tasks() if group == "task" else _group(group, config.defaults.get(group))
+    lines += [*_suites(), *_sweeps()]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -24,7 +24,7 @@ _VALUES: dict[str, tuple[str, ...] | None] = {
     "--config-dir": None,
     "--info": _INFO,
 }
-_OURS = ("--help", "--version", "--debug", "--offline")
+_OURS = ("--help", "--version", "--debug", "--offline", "--dry-run")
 _HYDRAS = ("--multirun", "--resolve", "--hydra-help", "--shell-completion")
 
 
@@ -33,7 +33,7 @@ class Flags:
     """What a command line asks for."""
 
     ours: set[str] = field(default_factory=set)
-    """Those of ``--help --version --debug --offline`` that are there."""
+    """Those of ``_OURS`` that are there."""
     hydras: list[str] = field(default_factory=list)
     """What Hydra gets of the flags, in its own form."""
     overrides: list[str] = field(default_factory=list)
@@ -69,8 +69,9 @@ def read_flags(arguments: Sequence[str]) -> Flags:
             flags.ours.add(name)
         else:
             flags.hydras.append(name)
-    if "--offline" in flags.ours:
-        flags.overrides.append("offline=true")
+    for flag, override in (("--offline", "offline=true"), ("--dry-run", "sweep.dry_run=true")):
+        if flag in flags.ours:
+            flags.overrides.append(override)
     return flags
 
 

@@ -8,6 +8,9 @@ from pgdm.errors import ConfigError, UnknownNameError
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
+# Folders of conf/ that Hydra reads for itself, or that are no choice of a run.
+_NO_GROUPS = ("hydra", "suite", "sweeps")
+
 
 def conf_dir() -> Path:
     """Return the folder of the settings: inside an installed package, else the repository's.
@@ -23,7 +26,8 @@ def conf_dir() -> Path:
     )
 
 
-def _folders(config_dir: str | Path | None) -> list[Path]:
+def folders(config_dir: str | Path | None) -> list[Path]:
+    """Return the folders of settings, the user's own one last."""
     own = [conf_dir()]
     return own if config_dir is None else [*own, Path(config_dir)]
 
@@ -32,10 +36,10 @@ def groups(config_dir: str | Path | None = None) -> list[str]:
     """Return the names of the config groups, such as ``task``."""
     names = {
         path.name
-        for folder in _folders(config_dir)
+        for folder in folders(config_dir)
         if folder.is_dir()
         for path in folder.iterdir()
-        if path.is_dir() and path.name[0] not in "._" and path.name != "hydra"
+        if path.is_dir() and path.name[0] not in "._" and path.name not in _NO_GROUPS
     }
     return sorted(names)
 
@@ -55,7 +59,7 @@ def available(group: str, config_dir: str | Path | None = None) -> list[str]:
         raise UnknownNameError("config group", group, known)
     names = {
         path.stem
-        for folder in _folders(config_dir)
+        for folder in folders(config_dir)
         for path in (folder / group).glob("*.yaml")
         if not path.name.startswith("_")
     }

@@ -21,6 +21,7 @@ from yaml import YAMLError
 
 from pgdm.config.groups import available, conf_dir, groups
 from pgdm.config.strict import build, flatten
+from pgdm.config.suites import suite, suites
 from pgdm.errors import ConfigError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -66,8 +67,9 @@ def from_dict_config(composed: DictConfig) -> ExperimentCfg:
     data = {str(key): value for key, value in plain.items()}
     chosen = data.get("run_dir")
     given = {"run_dir": "." if chosen is None else chosen}
-    if data.get("budget") is None:
+    if data.get("budget") == "paper":
         given["budget"] = _budget(data.get("total_frames"))
+    data.pop("sweep", None)  # of the command, not of a run
     cfg = build(ExperimentCfg, data | given)
     cfg.validate()
     check_device(cfg.device)
@@ -75,6 +77,7 @@ def from_dict_config(composed: DictConfig) -> ExperimentCfg:
 
 
 def _budget(total_frames: object) -> str:
+    """Return the true label: a shorter run is not to be set beside the paper's."""
     whole = isinstance(total_frames, int) and total_frames >= PAPER_FRAMES
     return "paper" if whole else "reduced"
 
@@ -126,7 +129,7 @@ def _composed(overrides: Sequence[str], folder: str | None = None) -> DictConfig
         with _LOCK, _own_hydra(), hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
             return hydra.compose("config", overrides=[*search, *overrides])
     except COMPOSITION_ERRORS as error:
-        raise explain(error, overrides) from error
+        raise explain(error, overrides, folder) from error
 
 
 def check_overrides(overrides: Sequence[str]) -> None:
@@ -139,6 +142,8 @@ def check_overrides(overrides: Sequence[str]) -> None:
         key, _, value = override.partition("=")
         if not key.strip("+~"):
             raise ConfigError(f"cannot read '{override}'; write key=value, such as seed=3")
+        if key == "suite":
+            raise ConfigError(f"a suite is named by its tasks: pgdm-run -m task={value}")
         if value.startswith("[") and key in groups():
             # Hydra would merge the options, so that the last one wins.
             raise ConfigError(
@@ -163,12 +168,15 @@ def _quoted(text: str) -> str:
     return f"'{escaped}'"
 
 
-def explain(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
+def explain(
+    error: Exception, overrides: Sequence[str] = (), config_dir: str | None = None
+) -> ConfigError:
     """Return what an error of COMPOSITION_ERRORS means for a user, as one line.
 
     Args:
         error: what Hydra, OmegaConf or the YAML reader raised.
         overrides: what the user gave.
+        config_dir: the user's own settings folder.
     """
     text = " ".join(str(error).split())
     if isinstance(error, MissingMandatoryValue):
@@ -177,7 +185,7 @@ def explain(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
     for tail in (" full_key:", " Config search path:", " object_type="):
         text = text.partition(tail)[0]
     if isinstance(error, MissingConfigException):
-        return _explain_missing(error, text)
+        return _explain_missing(error, text, config_dir)
     if isinstance(error, OverrideParseException):
         return ConfigError(f"cannot read '{error.override}'; write key=value, such as seed=3")
     if isinstance(error, YAMLError):
@@ -205,11 +213,27 @@ def _explain_text(text: str) -> ConfigError:
     return ConfigError(text)
 
 
-def _explain_missing(error: MissingConfigException, text: str) -> ConfigError:
+def _explain_missing(
+    error: MissingConfigException, text: str, config_dir: str | None
+) -> ConfigError:
     group, _, option = (error.missing_cfg_file or "").rpartition("/")
+    if group == "task" and error.options:
+        return _explain_task(option, error.options, config_dir)
     if group and error.options:
         return UnknownNameError(group, option, [o for o in error.options if o[0] != "_"])
     return ConfigError(text)
+
+
+def _explain_task(name: str, tasks: Sequence[str], config_dir: str | None) -> ConfigError:
+    if name in suites(config_dir):
+        size = len(suite(name, config_dir))
+        return ConfigError(
+            f"{name} is a suite of {size} tasks; to run them all: pgdm-run -m task={name}"
+        )
+    if "*" in name:
+        return ConfigError(f"several tasks are a sweep; to run them all: pgdm-run -m task={name}")
+    known = [task for task in tasks if task[0] != "_"]
+    return UnknownNameError("task", name, [*known, *suites(config_dir)])
 
 
 def _known_names() -> list[str]:

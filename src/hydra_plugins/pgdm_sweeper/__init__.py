@@ -1,0 +1,1 @@
+"""``hydra/sweeper=pgdm``: a thin shell around ``pgdm.sweep.expand``."""

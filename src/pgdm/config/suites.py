@@ -1,0 +1,122 @@
+"""Suites: named lists of tasks, written down or derived from what the tasks' files say."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pgdm.config.groups import available, folders
+from pgdm.errors import ConfigError, UnknownNameError
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_WILD = "*?["
+
+
+def suites(config_dir: str | Path | None = None) -> dict[str, Path]:
+    """Return the names of the suites, each with its file.
+
+    As with the options of groups, a name of pgdm's stays pgdm's.
+    """
+    own_last = [f for folder in folders(config_dir) for f in (folder / "suite").glob("*.yaml")]
+    found = {file.stem: file for file in reversed(own_last)}
+    return dict(sorted(found.items()))
+
+
+def suite(name: str, config_dir: str | Path | None = None) -> tuple[str, ...]:
+    """Return the tasks of a suite, in its order.
+
+    Raises:
+        UnknownNameError: if there is no such suite, or it names a task that does not exist.
+        ConfigError: if its file is wrong.
+    """
+    if name not in suites(config_dir):
+        raise UnknownNameError("suite", name, suites(config_dir))
+    return expand_tasks([name], config_dir)
+
+
+def expand_tasks(words: Iterable[str], config_dir: str | Path | None = None) -> tuple[str, ...]:
+    """Return the tasks that words name, each once, in the order of their first mention.
+
+    Args:
+        words: each a task, a suite, a pattern such as ``dhand-*``, or one of these after a minus,
+            which takes its tasks away from those named before.
+        config_dir: a folder of the user's own settings to look into besides.
+
+    Raises:
+        UnknownNameError: if a word is none of these.
+        ConfigError: if the file of a suite is wrong.
+    """
+    return tuple(_Expansion(config_dir).tasks(words, ()))
+
+
+class _Expansion:
+    """What there is to choose from, read once."""
+
+    def __init__(self, config_dir: str | Path | None) -> None:
+        self.folders = folders(config_dir)
+        self.all = available("task", config_dir)
+        self.suites = suites(config_dir)
+
+    def tasks(self, words: Iterable[str], inside: tuple[str, ...]) -> list[str]:
+        found: dict[str, None] = {}  # a set that keeps its order
+        for word in words:
+            for task in self._one(word.removeprefix("-"), inside):
+                if word.startswith("-"):
+                    found.pop(task, None)
+                else:
+                    found[task] = None
+        return list(found)
+
+    def _one(self, word: str, inside: tuple[str, ...]) -> Sequence[str]:
+        if word in self.all:
+            return [word]
+        if word in self.suites:
+            return self._suite(word, inside)
+        matches = fnmatch.filter(self.all, word) if any(c in word for c in _WILD) else []
+        if not matches:
+            raise UnknownNameError("task or suite", word, [*self.all, *self.suites])
+        return matches
+
+    def _suite(self, name: str, inside: tuple[str, ...]) -> Sequence[str]:
+        file = self.suites[name]
+        if name in inside:
+            raise ConfigError(f"{file}: the suite '{name}' contains itself; name its tasks")
+        content = _read(file)
+        tasks, where = content.get("tasks"), content.get("where")
+        if isinstance(tasks, list) and where is None:
+            return self.tasks(map(str, tasks), (*inside, name))
+        if isinstance(where, dict) and tasks is None:
+            return [task for task in self.all if self._fits(task, where)]
+        raise ConfigError(f"{file}: a suite has either tasks: [...] or where: {{key: value}}")
+
+    def _fits(self, task: str, where: dict[str, Any]) -> bool:
+        files = [folder / "task" / f"{task}.yaml" for folder in self.folders]
+        facts = task_facts(next(file for file in files if file.exists()))
+        return all(
+            facts.get(key) is not None if value == "any" else facts.get(key) == value
+            for key, value in where.items()
+        )
+
+
+def task_facts(file: Path) -> dict[str, Any]:
+    """Return what the file of a task itself says, with the hand that plays it as ``hand``."""
+    content = _read(file)
+    for entry in content.pop("defaults", None) or []:
+        for key, option in entry.items() if isinstance(entry, dict) else ():
+            if "/hand" in str(key):
+                content["hand"] = option
+    return content
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        content = yaml.load(file.read_text(encoding="utf-8"), Loader=_LOADER)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{file} holds no keys")
+    return content

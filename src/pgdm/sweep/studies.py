@@ -1,0 +1,119 @@
+"""Sweeps as files: what one would type after ``pgdm-run -m``, written down."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+
+from pgdm.config.groups import conf_dir, folders
+from pgdm.errors import ConfigError, UnknownNameError
+
+_KEY = "+sweep"
+
+# What of a command says which jobs, where, how fast or how often, and not which study it is.
+NOT_IN_A_NAME = (
+    "task", "seed", "sweep", "hydra", "run_dir", "resume", "offline", "num_threads", "device",
+    "tracking", "checkpoint",
+)  # fmt: skip
+
+
+def studies(config_dir: str | Path | None = None) -> dict[str, Path]:
+    """Return the names of the sweep files, each with its file; a name of pgdm's stays pgdm's."""
+    # In a checkout they lie beside conf/, in an installed package as well.
+    places = [conf_dir().parent, *folders(config_dir)[1:]]
+    own_last = [file for folder in places for file in (folder / "sweeps").glob("*.yaml")]
+    return dict(sorted((file.stem, file) for file in reversed(own_last)))
+
+
+def open_study(
+    overrides: Sequence[str], config_dir: str | Path | None = None
+) -> tuple[str | None, list[str], list[str]]:
+    """Read the sweep file that ``+sweep=NAME`` names.
+
+    Returns:
+        The name of the sweep file, None if there is none; what else was typed; and what the file
+        says, which is to stand before that.
+
+    Raises:
+        UnknownNameError: if there is no such sweep file.
+        ConfigError: if several are given, or the file is wrong.
+    """
+    named = [o.partition("=")[2] for o in overrides if o.partition("=")[0] == _KEY]
+    typed = [o for o in overrides if o.partition("=")[0] != _KEY]
+    for override in typed:
+        key, _, value = override.partition("=")
+        if key == "sweep" and (value in studies(config_dir) or value.endswith(".yaml")):
+            raise ConfigError(f"a sweep file is added with a plus: {_KEY}={value}")
+    if not named:
+        return None, typed, []
+    if len(named) > 1:
+        raise ConfigError(f"{_KEY} is there {len(named)} times; start one sweep at a time")
+    file = _find(named[0], config_dir)
+    return file.stem, typed, _read(file)
+
+
+def default_name(overrides: Sequence[str], study: str | None) -> str:
+    """Return the name of a sweep that was given none.
+
+    It follows from the sweep file and the overrides, but neither from tasks nor from seeds: more
+    of these belong to the same sweep.
+
+    Args:
+        overrides: as typed.
+        study: name of the sweep file.
+    """
+    given = {o.partition("=")[0]: o.partition("=")[2] for o in overrides}
+    rest = {
+        key: value
+        for key, value in sorted(given.items())
+        if re.split(r"[./@]", key.lstrip("+~"))[0] not in NOT_IN_A_NAME
+    }
+    parts = [study or "grid"]
+    if "budget" in rest:
+        parts.append(rest.pop("budget"))
+    if rest:
+        text = "-".join(rest.values())[:40]
+        digest = hashlib.sha256(repr(sorted(rest.items())).encode()).hexdigest()[:6]
+        parts += [text, digest]
+    return re.sub(r"[^\w.+-]+", "-", "-".join(parts))
+
+
+def _find(name: str, config_dir: str | Path | None) -> Path:
+    known = studies(config_dir)
+    if name in known:
+        return known[name]
+    file = Path(name).expanduser()
+    if file.suffix in (".yaml", ".yml") and file.is_file():
+        return file
+    raise UnknownNameError("sweep file", name, known)
+
+
+def _read(file: Path) -> list[str]:
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        raise ConfigError(f"{file} holds no sweep; write lines such as task: tcdm30")
+    return [f"{key}={_value(value, file)}" for key, value in content.items()]
+
+
+def _value(value: object, file: Path) -> str:
+    """Return a value as one would type it; a list is of values to try."""
+    if isinstance(value, dict):
+        raise ConfigError(f"{file}: write nested keys in one line, such as algo.clip: 0.1")
+    if isinstance(value, list):
+        return ",".join(_text(item) for item in value)
+    return _text(value)
+
+
+def _text(value: object) -> str:
+    if isinstance(value, list):
+        return f"[{','.join(_text(item) for item in value)}]"
+    if value is None or isinstance(value, bool):
+        return str(value).lower().replace("none", "null")
+    return str(value)
