@@ -39,7 +39,7 @@ class PgdmSweeper(Sweeper):
         HydraConfig.instance().set_config(self._whole)
         results = []
         for overrides, job in composed_jobs(self._loader, self._whole, [*self._given, *arguments]):
-            with read_write(self._whole.hydra):
+            with read_write(HydraConfig.get()):
                 HydraConfig.get().overrides.task = list(overrides)
             results.append(self._task_function(job))
         return results

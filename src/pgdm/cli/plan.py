@@ -10,11 +10,11 @@ from rich.table import Table
 
 from pgdm import paths
 from pgdm.cli.compose import Composed
-from pgdm.cli.errors import EXPECTED, report
-from pgdm.cli.train import notify, train
+from pgdm.cli.train import notify
 from pgdm.config.strict import build
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.sweep.estimate import Estimate, estimate
+from pgdm.sweep.local import run_sweep
 from pgdm.sweep.plan import LocalCfg, Plan, SweepCfg, check_fits, record
 from pgdm.sweep.planning import make_plan
 
@@ -23,14 +23,13 @@ _WIDE = 200  # columns where nobody's terminal sets them
 _MOST_NOTES = 3
 
 
-def run_planned(composed: Composed, name: str, command: str, debug: bool) -> int:
+def run_planned(composed: Composed, name: str, command: str) -> int:
     """Plan a sweep, show the plan, do it, and return the exit code.
 
     Args:
         composed: its jobs.
         name: its name if ``sweep.name`` has none.
         command: what was typed.
-        debug: whether to show tracebacks.
 
     Raises:
         PgdmError: if a job's settings are wrong, or the sweep's folder holds another sweep.
@@ -46,7 +45,7 @@ def run_planned(composed: Composed, name: str, command: str, debug: bool) -> int
         print("nothing was started (sweep.dry_run)")
         return 0
     record(plan)
-    return _run(plan, sweep, launcher, debug)
+    return run_sweep(plan, sweep, launcher, notify)
 
 
 def _launcher(composed: Composed) -> LocalCfg:
@@ -59,24 +58,6 @@ def _launcher(composed: Composed) -> LocalCfg:
     if (memory := launcher.memory_per_job_gb) <= 0:
         raise ConfigError(f"hydra.launcher.memory_per_job_gb is {memory}; it must be above 0")
     return launcher
-
-
-def _run(plan: Plan, sweep: SweepCfg, launcher: LocalCfg, debug: bool) -> int:
-    """Run one after the other; a failed one does not stop the others, an interrupted one does."""
-    del sweep, launcher
-    codes = []
-    for number, job in enumerate(plan.jobs, 1):
-        print(f"run {number} of {len(plan.jobs)}: {job.cfg.run_dir}", file=sys.stderr)
-        try:
-            codes.append(train(job.cfg))
-        except EXPECTED as error:
-            codes.append(report(error, debug))
-        if codes[-1] >= 128:
-            return codes[-1]
-    failed = sum(code != 0 for code in codes)
-    if failed:
-        print(f"{failed} of {len(codes)} runs failed", file=sys.stderr)
-    return max(codes)
 
 
 def _show(plan: Plan, cost: Estimate) -> None:

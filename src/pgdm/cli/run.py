@@ -48,7 +48,7 @@ def _main(flags: Flags, command: str, debug: bool) -> int:
 
     set_up_logging(debug)
     if composed.is_sweep:
-        return run_planned(composed, default_name(typed, study), command, debug)
+        return run_planned(composed, default_name(typed, study), command)
     return train(from_dict_config(composed.jobs[0][1]))
 
 
