@@ -35,9 +35,7 @@ def test_no_study() -> None:
         ("+experiment: quickstart\n", ["+experiment=quickstart"]),
     ],
 )
-def test_a_file_says_what_one_would_type(
-    tmp_path: Path, text: str, overrides: list[str]
-) -> None:
+def test_a_file_says_what_one_would_type(tmp_path: Path, text: str, overrides: list[str]) -> None:
     (tmp_path / "mine.yaml").write_text(text)
     assert open_study([f"+sweep={tmp_path / 'mine.yaml'}"]) == ("mine", [], overrides)
 
