@@ -23,10 +23,12 @@ from pgdm.cli.progress import ProgressView, duration
 from pgdm.cli.summary import summary_table
 from pgdm.config.groups import available, groups
 from pgdm.config.store import compose
+from pgdm.config.suites import suites
 from pgdm.errors import ConfigError
 from pgdm.experiment import RunResult
 from pgdm.rl.callback import Progress
 from pgdm.stop import StopRequest
+from pgdm.sweep.studies import studies
 
 # The command line itself.
 
@@ -37,14 +39,25 @@ def test_help_names_every_group_and_option() -> None:
     for group in groups():
         assert f"  {group} " in outcome.out.replace("+", "")
         assert all(option in outcome.out for option in available(group))
-    for key in ("seed", "total_frames", "num_envs", "num_threads", "run_dir", "resume", "budget"):
+    for key in ("seed", "total_frames", "num_envs", "num_threads", "run_dir", "resume"):
         assert f"  {key}=" in outcome.out
+    for suite in suites():
+        assert f"  {suite} " in outcome.out
+    for study in studies():
+        assert f"  {study} " in outcome.out
+    for key in ("sweep.name", "sweep.detach", "sweep.max_attempts", "hydra.launcher.max_jobs"):
+        assert f"  {key}=" in outcome.out
+    assert "hydra/launcher=local" in outcome.out
 
 
 def test_help_lists_your_own_settings_too(tmp_path: Path) -> None:
     (tmp_path / "mine" / "task").mkdir(parents=True)
     (tmp_path / "mine" / "task" / "juggle.yaml").touch()
-    assert "juggle" in command("pgdm-run", "--config-dir", "mine", "--help").out
+    for folder in ("suite", "sweeps"):
+        (tmp_path / "mine" / folder).mkdir()
+        (tmp_path / "mine" / folder / f"{folder}_of_mine.yaml").write_text("tasks: [juggle]\n")
+    out = command("pgdm-run", "--config-dir", "mine", "--help").out
+    assert all(name in out for name in ("juggle", "suite_of_mine", "sweeps_of_mine"))
 
 
 @pytest.mark.parametrize("name", ["pgdm-run", "pgdm"])
@@ -281,14 +294,15 @@ def test_tasks_says_what_is_missing() -> None:
 
 
 def test_multirun_goes_on_after_a_failure_and_tells(library_home: Path, tmp_path: Path) -> None:
-    (tmp_path / "b").write_text("in the way")
-    outcome = command("pgdm-run", "--offline", "-m", *TINY, "run_dir=a,b,c")
+    (tmp_path / "run1").write_text("in the way")
+    line = ["--offline", "-m", *TINY, "seed=0,1,2", "run_dir=run${seed}"]
+    outcome = command("pgdm-run", *line)
     assert outcome.code == 1
     assert len(outcome.errors) == 1
-    assert "'b' is a file" in outcome.errors[0]
+    assert "run1' is a file" in outcome.errors[0]
     assert "1 of 3 runs failed" in outcome.err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
-    for name in ("a", "c"):
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run0", "run1", "run2", "runs"]
+    for name in ("run0", "run2"):
         assert json.loads((tmp_path / name / "result.json").read_text())["status"] == "finished"
 
 

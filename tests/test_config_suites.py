@@ -129,7 +129,8 @@ def test_a_suite_of_a_task_of_your_own(tmp_path: Path) -> None:
         ("tasks: [duck-lift]\nwhere: {tcdm30: true}\n", "either tasks"),
         ("tasks: [duck-lft]\n", "unknown task or suite 'duck-lft'"),
         ("tasks: [duck\n", "mine.yaml is not valid YAML"),
-        ("", "mine.yaml holds no keys"),
+        ("- duck-lift\n", "mine.yaml holds no keys"),
+        ("", "either tasks"),
     ],
 )
 def test_a_wrong_suite(tmp_path: Path, text: str, message: str) -> None:

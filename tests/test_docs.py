@@ -10,8 +10,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from pgdm.config.store import compose
+from pgdm.config.suites import expand_tasks
+from pgdm.sweep.expand import grid
+from pgdm.sweep.studies import open_study
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
@@ -68,9 +72,11 @@ def _commands() -> list[str]:
 def test_settings_in_commands_exist(command: str) -> None:
     words = [word for word in command.split()[1:] if not word.startswith("-")]
     words = [word for word in words if word != "job"]
-    if " -m " in command:
-        words = [word.split(",")[0] for word in words]
-    compose(words)
+    study, typed, written = open_study(words)
+    if study is not None or " -m " in command:
+        jobs = grid(OverridesParser.create().parse_overrides([*written, *typed]), expand_tasks)
+        typed = [word for word in jobs[-1] if not word.startswith("hydra")]
+    compose(typed)
 
 
 def _follow(heading: str, folder: Path) -> None:

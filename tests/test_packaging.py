@@ -59,7 +59,7 @@ def imported_packages() -> set[str]:
                 names |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names.add(node.module)
-    return {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"pgdm"}
+    return {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"pgdm", "hydra_plugins"}
 
 
 def test_what_is_imported_is_declared_and_the_reverse() -> None:
@@ -137,7 +137,8 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 @pytest.mark.slow
 def test_settings_are_in_sdist_and_wheel(built: tuple[Path, Path]) -> None:
-    own = {p.relative_to(REPOSITORY) for p in (REPOSITORY / "conf").rglob("*.yaml")}
+    files = [p for name in ("conf", "sweeps") for p in (REPOSITORY / name).rglob("*.yaml")]
+    own = {p.relative_to(REPOSITORY) for p in files}
     with tarfile.open(built[0]) as archive:
         inner = {Path(*Path(name).parts[1:]) for name in archive.getnames()}
     assert own <= inner
@@ -147,6 +148,8 @@ def test_settings_are_in_sdist_and_wheel(built: tuple[Path, Path]) -> None:
     assert Path("pgdm/conf/__init__.py") in names
     assert Path("pgdm/py.typed") in names
     assert {Path("pgdm/report/page.html"), Path("pgdm/report/paper.yaml")} <= names
+    assert Path("hydra_plugins/pgdm_sweeper/sweeper.py") in names
+    assert Path("hydra_plugins/__init__.py") not in names  # other packages have plugins there too
 
 
 @pytest.mark.slow
@@ -165,6 +168,8 @@ def test_an_installed_wheel_works_from_elsewhere(
     package = "import hydra, pgdm.conf; print(pgdm.conf.__file__)"
     where = _run(programs / "python", "-c", package, cwd=elsewhere)
     assert str(environment) in where
+    plan = _run(programs / "pgdm-run", "+sweep=sim2real", "--dry-run", cwd=elsewhere)
+    assert "dmanus-sim2real" in plan
     _run(programs / "pgdm-run", *TINY_RUN, cwd=elsewhere, PGDM_HOME=str(library_home))
     result = json.loads((elsewhere / "out/tiny/result.json").read_text(encoding="utf-8"))
     assert result["status"] == "finished"

@@ -37,9 +37,10 @@ class PgdmSweeper(Sweeper):
         from pgdm.sweep.expand import composed_jobs
 
         HydraConfig.instance().set_config(self._whole)
+        hydra: Any = HydraConfig.get()
         results = []
         for overrides, job in composed_jobs(self._loader, self._whole, [*self._given, *arguments]):
-            with read_write(HydraConfig.get()):
-                HydraConfig.get().overrides.task = list(overrides)
+            with read_write(hydra):
+                hydra.overrides.task = list(overrides)
             results.append(self._task_function(job))
         return results

@@ -63,7 +63,10 @@ def _frames_done(job: Job) -> int:
     total = job.cfg.total_frames
     if folder.result.get("status") == "finished":
         return int(folder.result.get("frames", 0))
-    lines = folder.log.tail()
+    try:
+        lines = folder.log.tail()
+    except RunError:  # starting it will tell
+        return 0
     return min(int(lines[-1]["frames"]), total - 1) if lines else 0
 
 

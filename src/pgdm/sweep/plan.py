@@ -114,7 +114,7 @@ def check_fits(plan: Plan) -> tuple[Job, ...]:
         changes = difference(old.cfg, new.cfg) + [f"{k}: {a} -> {b}" for k, a, b in whole if a != b]
         raise SweepError(
             f"sweep '{plan.name}' in '{plan.folder}' was made with other settings ({new.name}: "
-            f"{'; '.join(changes)}{f'; so do {others} other jobs' if others else ''}); choose "
+            f"{'; '.join(changes)}{f'; {others} more differ too' if others else ''}); choose "
             "another sweep.name, or the settings it was made with"
         )
     return known
