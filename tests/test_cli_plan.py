@@ -25,7 +25,7 @@ def shown(outcome: Outcome) -> dict[str, str]:
 def started(monkeypatch: pytest.MonkeyPatch) -> list[Plan]:
     """Have sweeps noted instead of run."""
     plans: list[Plan] = []
-    monkeypatch.setattr("pgdm.cli.plan._run", lambda plan, *_: plans.append(plan) or 0)
+    monkeypatch.setattr("pgdm.cli.plan.run_sweep", lambda plan, *_: plans.append(plan) or 0)
     return plans
 
 

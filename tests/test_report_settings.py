@@ -26,7 +26,7 @@ def test_task_and_seed_and_their_hand_are_not_part_of_it(task: str) -> None:
 
 
 def test_nor_is_what_changes_no_result() -> None:
-    beside = ("num_threads=3", "tracking=none", "eval.video=false", "run_dir=x", "budget=smoke")
+    beside = ("num_threads=3", "tracking=none", "eval.video=false", "run_dir=x")
     assert setting("task=cup-pour1", *beside) == setting("task=cup-pour1")
 
 

@@ -72,7 +72,7 @@ class RunLog:
         """
         try:
             raw = self.path.read_bytes()
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return []
         except OSError as error:
             raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
@@ -99,7 +99,7 @@ class RunLog:
                 size = file.seek(0, os.SEEK_END)
                 file.seek(max(0, size - size_bytes))
                 lines = file.read().split(b"\n")[:-1]
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return []
         except OSError as error:
             raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
@@ -116,7 +116,7 @@ class RunLog:
         """
         try:
             raw = self.path.read_bytes()
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return []
         except OSError as error:
             raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
