@@ -29,7 +29,8 @@ FLOORS: list[set[str]] = [
     {"experiment"},
     {"make"},  # environments by task id
     {"pgdm"},  # the package's own __init__: what `import pgdm` offers
-    {"cli", "sweep", "report", "realworld", "hydra_plugins"},
+    {"report"},
+    {"cli", "sweep", "realworld", "hydra_plugins"},
 ]
 BASE = FLOORS[0] | FLOORS[1]
 

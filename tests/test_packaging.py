@@ -146,6 +146,7 @@ def test_settings_are_in_sdist_and_wheel(built: tuple[Path, Path]) -> None:
     assert {Path("pgdm") / path for path in own} <= names
     assert Path("pgdm/conf/__init__.py") in names
     assert Path("pgdm/py.typed") in names
+    assert {Path("pgdm/report/page.html"), Path("pgdm/report/paper.yaml")} <= names
 
 
 @pytest.mark.slow

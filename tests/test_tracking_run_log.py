@@ -132,6 +132,27 @@ def test_tail_of_a_long_log(tmp_path: Path) -> None:
     assert tail[-1]["frames"] == 200
 
 
+def test_thinned_log_has_every_evaluation(tmp_path: Path) -> None:
+    log = filled(tmp_path, 1000)
+    for i in (1, 500, 1000, 1000):
+        log.append({"eval/success": i / 2}, frames=100 * i, iteration=i, time_s=i, kind="eval")
+    with open(log.path, "a") as file:
+        file.write('{"frames": 5, "kind": "eval"')  # a process died while it wrote
+    found = log.thinned(50)
+    evaluations = [record for record in found if record["kind"] == "eval"]
+    assert [record["frames"] for record in evaluations] == [100, 50000, 100000]
+    frames = [int(record["frames"]) for record in found if record["kind"] == "train"]
+    assert 45 <= len(frames) <= 50
+    assert max(np.diff(frames)) <= 3000
+    assert all(record in log.read() for record in found)
+
+
+def test_thinned_short_log_is_whole(tmp_path: Path) -> None:
+    log = filled(tmp_path, 3)
+    assert log.thinned(100) == log.read()
+    assert RunLog(tmp_path / "none").thinned(100) == []
+
+
 def test_unwritable_log_names_the_cure(tmp_path: Path) -> None:
     log = RunLog(tmp_path / "gone" / "metrics.jsonl")
     with pytest.raises(RunError, match=r"No such file.*start the same command again"):

@@ -130,6 +130,25 @@ def view(
     view_task(task, video, pregrasp, offline)
 
 
+@app.command("report")
+def write_report(
+    places: Annotated[
+        list[str],
+        typer.Argument(metavar="DIR...", help="Folders of runs, or an MLflow experiment's name."),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write into [DIR/report].", metavar="FOLDER")
+    ] = None,
+    uri: Annotated[
+        str | None, typer.Option(help="MLflow store with the experiment [runs/mlflow.db].")
+    ] = None,
+) -> None:
+    """Set runs beside the paper: one page, tables and pictures."""
+    from pgdm.cli.report import make_report
+
+    make_report(places, out, uri)
+
+
 @app.command()
 def tasks(
     tcdm30: Annotated[

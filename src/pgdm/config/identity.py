@@ -6,11 +6,13 @@ import dataclasses
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pgdm.config.schema import ExperimentCfg
 from pgdm.config.strict import flatten
 from pgdm.errors import RunError
+
+if TYPE_CHECKING:  # it loads the simulator and torch
+    from pgdm.config.schema import ExperimentCfg
 
 # Keys that change where, when and how a run is done or shown, not what it computes.
 _BESIDE = (
@@ -38,11 +40,12 @@ _BESIDE = (
 def identity(cfg: ExperimentCfg) -> dict[str, Any]:
     """Return the keys (dotted) and values that change the result of an experiment."""
     flat = flatten(dataclasses.asdict(cfg))
-    return {k: v for k, v in flat.items() if not any(_inside(k, beside) for beside in _BESIDE)}
+    return {k: v for k, v in flat.items() if changes_result(k)}
 
 
-def _inside(key: str, part: str) -> bool:
-    return key == part or key.startswith(f"{part}.")
+def changes_result(key: str) -> bool:
+    """Return whether a setting, by its dotted key, acts on what an experiment computes."""
+    return not any(key == part or key.startswith(f"{part}.") for part in _BESIDE)
 
 
 def identity_hash(cfg: ExperimentCfg) -> str:

@@ -81,17 +81,22 @@ class Store:
         Raises:
             TrackingError: if another process holds the lock for minutes.
         """
-        os.environ.update({k: v for k, v in _SETTINGS.items() if k not in os.environ})
-        from mlflow import MlflowClient
-
-        # The first two announce each step of making a database; the third one's complaints come
-        # to us as errors as well.
-        for name, level in (("mlflow", "WARNING"), ("alembic", "WARNING"), ("urllib3", "ERROR")):
-            logging.getLogger(name).setLevel(level)
         file = sqlite_file(uri)
         with _only_one(file):
-            client = MlflowClient(tracking_uri=uri)
+            client = connect(uri)
             return cls(client, uri, _experiment(client, experiment, file))
+
+
+def connect(uri: str) -> MlflowClient:
+    """Return a quiet client of a store; a SQLite file that is missing is made."""
+    os.environ.update({k: v for k, v in _SETTINGS.items() if k not in os.environ})
+    from mlflow import MlflowClient
+
+    # The first two announce each step of making a database; the third one's complaints come
+    # to us as errors as well.
+    for name, level in (("mlflow", "WARNING"), ("alembic", "WARNING"), ("urllib3", "ERROR")):
+        logging.getLogger(name).setLevel(level)
+    return MlflowClient(tracking_uri=uri)
 
 
 def sqlite_file(uri: str) -> Path | None:

@@ -1,0 +1,1 @@
+"""Results as a page, tables and pictures, beside the paper's and those of doing nothing."""

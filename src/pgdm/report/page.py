@@ -1,0 +1,216 @@
+"""The report as one self-contained page, with its tables and pictures beside it."""
+
+from __future__ import annotations
+
+import base64
+import math
+import os
+import shlex
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from pgdm.config.store import PAPER_FRAMES
+from pgdm.errors import RunError
+from pgdm.report import export, figures, tables
+from pgdm.report.curves import curves
+from pgdm.report.results import Results, paper
+from pgdm.report.runs import ERROR, SUCCESS
+from pgdm.report.source import Found, Progress, find
+from pgdm.report.statistics import DRAWS, Estimate
+
+PAGE = "report.html"
+_NONE = "-"
+
+
+def write_report(
+    places: Sequence[str], out: Path, progress: Progress, uri: str | None = None
+) -> tuple[Path, Results]:
+    """Write the report on the runs of some folders and MLflow experiments.
+
+    Args:
+        places: folders, or names of experiments.
+        out: folder to write into; made if it is missing.
+        progress: told how far it is.
+        uri: the MLflow store; None is the one in the folder of runs.
+
+    Returns:
+        The page, and the runs on it.
+
+    Raises:
+        RunError: if there are no runs that can be read, or the folder cannot be written.
+        TrackingError: if there is no such experiment.
+    """
+    found = find(places, uri, out, progress)
+    if not found.runs:
+        folder, reason = next(iter(found.unreadable.items()))
+        raise RunError(f"none of {len(found.unreadable)} runs can be read; {folder}: {reason}")
+    results = Results(found.runs)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        context = _context(results, found, places, out, progress)
+        (out / PAGE).write_text(_render(context), encoding="utf-8")
+    except OSError as error:
+        raise RunError(f"cannot write the report to '{out}': {error.strerror or error}") from error
+    return out / PAGE, results
+
+
+def _context(
+    results: Results, found: Found, places: Sequence[str], out: Path, progress: Progress
+) -> dict[str, Any]:
+    by_task = {setting: tables.task_rows(results, setting) for setting in results.settings}
+    progress("computing statistics", 0, 1)
+    averages = {
+        "source": tables.by_source(results),
+        "ablation": tables.by_ablation(results),
+        "baseline": tables.baselines(results),
+    }
+    aggregates, better = tables.aggregates(results), tables.improvements(results)
+    progress("writing tables", 0, 1)
+    export.runs(results, out)
+    export.tasks(results, [row for rows in by_task.values() for row in rows], out)
+    export.averages(results, [row for rows in averages.values() for row in rows], out)
+    export.statistics(results, aggregates, better, out)
+    export.curves(results, out)
+    pictures = _pictures(results, averages["baseline"], aggregates, out, progress)
+    return {
+        "results": results,
+        "places": places,
+        "now": time.strftime("%Y-%m-%d %H:%M"),
+        "counts": results.counts(),
+        "budgets": Counter(run.budget for run in results.runs),
+        "deviations": {s: results.deviations(s) for s in results.settings},
+        "colours": {s: figures.colour(results, s) for s in results.settings},
+        "averages": averages,
+        "by_task": by_task,
+        "aggregates": aggregates,
+        "better": better,
+        "null": paper()["null_policy"],
+        "pictures": pictures,
+        "films": _films(results, out, progress),
+        "provenance": _provenance(results),
+        "commands": _commands(results),
+        "typed": found.commands,
+        "unreadable": found.unreadable,
+        "folders": {run.path: os.path.relpath(run.path, out.absolute()) for run in results.runs},
+        "paper_frames": PAPER_FRAMES,
+        "draws": DRAWS,
+        "files": [*export.FILES, *(f"{name}.png" for name in pictures)],
+    }
+
+
+def _pictures(
+    results: Results,
+    baselines: Sequence[tables.Average],
+    aggregates: export.Aggregates,
+    out: Path,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Draw everything; the page gets names and pictures as data addresses."""
+    found: dict[str, Any] = {}
+    if any(len(run.evaluations["frames"]) for run in results.runs):
+        for name, metric in (("curves", SUCCESS), ("curves_error", ERROR)):
+            panels = curves(
+                *(results, metric, out / f"{name}.png"),
+                lambda done, of, name=name: progress(f"drawing {name}", done, of),
+            )
+            found[name] = {task: _data(panel) for task, panel in panels.items()}
+    progress("drawing statistics", 0, 1)
+    if aggregates:
+        iqms = {setting: iqm for setting, (iqm, *_) in aggregates.items()}
+        shares = {setting: profile for setting, (_, profile, *_) in aggregates.items()}
+        drawn = figures.intervals(results, iqms, "interquartile mean of success")
+        found["iqm"] = _data(figures.saved(drawn, out / "iqm.png"))
+        drawn = figures.profiles(results, shares)
+        found["profiles"] = _data(figures.saved(drawn, out / "profiles.png"))
+    if baselines:
+        drawn = figures.bars(results, baselines)
+        found["baselines"] = _data(figures.saved(drawn, out / "baselines.png"))
+    return found
+
+
+def _films(results: Results, out: Path, progress: Progress) -> list[dict[str, Any]]:
+    """Return the films, each with a small picture; the first of each task and setting leads."""
+    found, seen = [], set()
+    for number, run in enumerate(results.runs):
+        progress("shrinking pictures", number, len(results.runs))
+        small = run.video and figures.thumbnail(run.video.with_suffix(".png"))
+        if run.video and small:
+            address = quote(os.path.relpath(run.video, out.absolute()))
+            cell = run.setting, run.task
+            film = {"run": run, "picture": _data(small, "jpeg"), "address": address}
+            found.append(film | {"leads": cell not in seen})
+            seen.add(cell)
+    return found
+
+
+def _provenance(results: Results) -> list[tuple[str, list[tuple[str, int]]]]:
+    """Return what the runs were made with: a fact, and each of its values with its runs."""
+    facts: dict[str, Counter[str]] = {}
+    for run in results.runs:
+        of_run = {
+            "git revision": run.result.get("git"),
+            "assets": run.result.get("asset_source"),
+            "start": run.result.get("pregrasp_used"),
+            **run.result.get("versions", {}),
+        }
+        for name, value in of_run.items():
+            if value is not None:
+                facts.setdefault(name, Counter())[str(value)] += 1
+    return [(name, counter.most_common()) for name, counter in facts.items()]
+
+
+def _commands(results: Results) -> list[str]:
+    """Return what makes these runs again, one command a setting."""
+    found = []
+    for setting in results.settings:
+        tasks = [task for task in results.tasks if results.cell(setting, task)]
+        seeds = results.seeds(setting)
+        words = [f"task={','.join(tasks)}", f"seed={','.join(map(str, seeds))}"]
+        words += [f"total_frames={setting.total_frames}", *setting.changes]
+        many = " -m" if len(tasks) * len(seeds) > 1 else ""
+        found.append(f"pgdm-run{many} {' '.join(map(shlex.quote, words))}")
+    return found
+
+
+def _render(context: dict[str, Any]) -> str:
+    environment = Environment(
+        loader=PackageLoader("pgdm.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "percent": lambda value, digits=1: _shown(value, f".{digits}%"),
+        "points": lambda value: _shown(100 * value, "+.1f"),
+        "metres": lambda value: _shown(value, ".2e"),
+        "radians": lambda value: _shown(value, ".2f"),
+        "between": _between,
+        "frames": _frames,
+    }
+    return environment.get_template("page.html").render(context)
+
+
+def _shown(value: float, form: str) -> str:
+    return format(value, form) if isinstance(value, int | float) and value == value else _NONE
+
+
+def _between(estimate: Estimate, form: str = ".1%") -> str:
+    """Return an interval; empty where there is none."""
+    if math.isnan(estimate.low):
+        return ""
+    return f"[{estimate.low:{form}}, {estimate.high:{form}}]"
+
+
+def _frames(count: int) -> str:
+    return f"{count / 1e6:.3g}M" if count >= 1_000_000 else f"{count:,}"
+
+
+def _data(picture: bytes, kind: str = "png") -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"

@@ -1,0 +1,110 @@
+"""All runs of a report in their places: setting by task by seed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from importlib import resources
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from pgdm.report.runs import STATES, SUCCESS, Run
+from pgdm.report.settings import Setting, labels
+
+Array = NDArray[np.float64]
+
+
+@cache
+def paper() -> dict[str, Any]:
+    """Return what the paper states, and what doing nothing gives: ``paper.yaml``."""
+    text = resources.files("pgdm.report").joinpath("paper.yaml").read_text(encoding="utf-8")
+    return yaml.safe_load(text)
+
+
+class Results:
+    """The runs of a report.
+
+    Args:
+        runs: all of them; of several with equal setting, task and seed one counts, which is the
+            finished, longest, newest one.
+    """
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        best: dict[tuple[Setting, str, int], Run] = {}
+        for run in sorted(runs, key=_worth):
+            best[run.setting, run.task, run.seed] = run
+        kept = {run.path for run in best.values()}
+        self.doubles = [run for run in runs if run.path not in kept]
+        found = {run.setting for run in best.values()}
+        self.settings = sorted(found, key=lambda s: (len(s.changes), -s.total_frames, s.changes))
+        place = {setting: number for number, setting in enumerate(self.settings)}
+        self.runs = sorted(best.values(), key=lambda r: (r.task, place[r.setting], r.seed))
+        self.labels = labels(self.settings)
+        self.tasks = sorted({run.task for run in self.runs})
+        self._cells: dict[tuple[Setting, str], list[Run]] = {}
+        for run in self.runs:
+            self._cells.setdefault((run.setting, run.task), []).append(run)
+
+    def cell(self, setting: Setting, task: str) -> list[Run]:
+        """Return the runs of a setting on a task, by seed, in whatever state they are."""
+        return self._cells.get((setting, task), [])
+
+    def seeds(self, setting: Setting) -> list[int]:
+        """Return the seeds that a setting has on any task."""
+        return sorted({run.seed for run in self.runs if run.setting == setting})
+
+    def states(self, setting: Setting, task: str) -> dict[int, str]:
+        """Return the state of each seed that the setting has on any task."""
+        there = {run.seed: run.state for run in self.cell(setting, task)}
+        return {seed: there.get(seed, "missing") for seed in self.seeds(setting)}
+
+    def scores(
+        self,
+        setting: Setting,
+        metric: str = SUCCESS,
+        wanted: Callable[[Run], bool] = lambda run: True,
+    ) -> dict[str, Array]:
+        """Return a metric of the finished runs of a setting: task to one number a run."""
+        found = {}
+        for task in self.tasks:
+            runs = [run for run in self.cell(setting, task) if run.finished and wanted(run)]
+            values = np.array([run.metric(metric) for run in runs])
+            if np.isfinite(values).any():
+                found[task] = values[np.isfinite(values)]
+        return found
+
+    def deviations(self, setting: Setting, *groups: str) -> list[str]:
+        """Return why a setting's results cannot be set against the paper's.
+
+        Args:
+            groups: config groups in which the paper's own table differs in the same way.
+        """
+        found = setting.deviations(*groups)
+        asked = setting.option("pregrasp")
+        starts = Counter(r.start for r in self.runs if r.setting == setting and r.start != asked)
+        return found + [f"start {start}, not {asked}: {n} runs" for start, n in starts.items()]
+
+    def counts(self) -> dict[str, int]:
+        """Return how many runs are in each state."""
+        counter = Counter(run.state for run in self.runs)
+        return {state: counter[state] for state in STATES if counter[state]}
+
+
+def known(run: Run, key: str) -> float:
+    """Return a figure of the paper for a run's task; NaN if it reports none."""
+    value = run.facts.get(key)
+    return float(value) if isinstance(value, int | float) else np.nan
+
+
+def average(values: Iterable[float]) -> float:
+    """Return the mean of the finite values; NaN if there are none."""
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else np.nan
+
+
+def _worth(run: Run) -> tuple[bool, int, float]:
+    return run.finished, run.frames, run.modified

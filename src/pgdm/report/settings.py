@@ -1,0 +1,132 @@
+"""What a run was made with besides task and seed: how it differs from the paper's settings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from pgdm.config.describe import describe
+from pgdm.config.groups import available, conf_dir
+from pgdm.config.identity import changes_result
+from pgdm.config.store import PAPER_FRAMES, compose_plain
+from pgdm.config.strict import flatten
+
+# Config group -> the key in which a configuration keeps the name of the option that was chosen.
+GROUPS = {
+    "method": "method.name",
+    "ablation": "ablation.name",
+    "pregrasp": "pregrasp.source",
+    "action": "action.kind",
+    "algo": "algo.name",
+    "obs": "obs.layout",
+    "reference": "reference.frame",
+    "hand": "hand.name",
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Runs with the same setting differ in task and seed only."""
+
+    options: tuple[tuple[str, str], ...]
+    """Config group and chosen option; without the hand, where it is the task's own."""
+    changes: tuple[str, ...]
+    """Overrides that make it from pgdm's defaults, which are the paper's settings."""
+    total_frames: int
+    """Length of the training, environment steps."""
+
+    def option(self, group: str) -> str:
+        """Return the option of a group."""
+        return dict(self.options).get(group, "?")
+
+    @property
+    def method(self) -> str:
+        """Name of the method."""
+        return self.option("method")
+
+    @property
+    def with_pregrasp(self) -> bool:
+        """Whether episodes start at a pre-grasp."""
+        return self.option("pregrasp") != "none"
+
+    def rest(self, *groups: str) -> tuple[int, tuple[str, ...]]:
+        """Return what is left of it when the options of some groups are put aside."""
+        return self.total_frames, tuple(c for c in self.changes if c.split("=")[0] not in groups)
+
+    def deviations(self, *groups: str) -> list[str]:
+        """Return why its results cannot be set against the paper's; empty if they can.
+
+        Args:
+            groups: those in which the paper's own table differs in the same way.
+        """
+        frames, changes = self.rest(*groups)
+        fewer = [f"{frames:,} of {PAPER_FRAMES:,} frames"] if frames < PAPER_FRAMES else []
+        return [*fewer, *changes]
+
+
+def setting_of(config: Mapping[str, Any]) -> Setting:
+    """Return the setting of a run's configuration."""
+    flat = {
+        key: value
+        for key, value in flatten(config).items()
+        if changes_result(key) and key not in ("seed", "format") and not key.startswith("task.")
+    }
+    task = config.get("task")
+    own_hand = _hand_of(str(task.get("id")) if isinstance(task, Mapping) else "")
+    if own_hand in (None, flat.get("hand.name")):
+        flat = {key: value for key, value in flat.items() if not key.startswith("hand.")}
+    chosen = {group: str(flat[key]) for group, key in GROUPS.items() if key in flat}
+    usual = _composed(frozenset())
+    other = {g: option for g, option in chosen.items() if option != usual.get(GROUPS[g])}
+    base = _composed(frozenset((g, o) for g, o in other.items() if o in available(g)))
+    options = [f"{group}={option}" for group, option in other.items()]
+    names = GROUPS.values()
+    rest = [
+        f"{key}={_text(value)}"
+        for key, value in flat.items()
+        if key not in names and not _equal(value, base.get(key))
+    ]
+    total = config.get("total_frames")
+    frames = total if isinstance(total, int) else 0
+    return Setting(tuple(chosen.items()), (*options, *rest), frames)
+
+
+def labels(settings: Iterable[Setting]) -> dict[Setting, str]:
+    """Return short names that tell settings apart: what all have in common is left out."""
+    settings = list(settings)
+    several = len(settings) > 1
+    shared = set(settings[0].changes).intersection(*(s.changes for s in settings))
+    lengths = {s.total_frames for s in settings}
+    found = {}
+    for setting in settings:
+        own = [c for c in setting.changes if not (several and c in shared)]
+        parts = [setting.method, *(c for c in own if not c.startswith("method="))]
+        if len(lengths) > 1:
+            parts.append(f"{setting.total_frames:,} frames")
+        found[setting] = ", ".join(parts)
+    return found
+
+
+@cache
+def _composed(options: frozenset[tuple[str, str]]) -> dict[str, Any]:
+    return flatten(compose_plain([f"{group}={option}" for group, option in sorted(options)]))
+
+
+@cache
+def _hand_of(task: str) -> str | None:
+    """Return the hand that a task is for; None if it is not one of pgdm's."""
+    file = conf_dir() / "task" / f"{task}.yaml"
+    if not task or not file.is_file():
+        return None
+    return next((o for group, o in describe(file).defaults.items() if "/hand" in group), None)
+
+
+def _equal(a: Any, b: Any) -> bool:
+    return a == b or str(a) == str(b)
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)

@@ -1,0 +1,224 @@
+"""The report's tables: by task, and averages set beside those of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from pgdm.report import statistics
+from pgdm.report.results import Results, average, known, paper
+from pgdm.report.runs import ERROR, LIFTED, ROTATION, SUCCESS, SUCCESS_MEAN, Run
+from pgdm.report.settings import Setting
+from pgdm.report.statistics import Estimate
+
+NOTHING = Estimate(np.nan, np.nan, np.nan)
+THRESHOLDS = np.linspace(0.0, 1.0, 51)
+"""Of the performance profile, in success."""
+
+
+@dataclass(frozen=True)
+class TaskRow:
+    """One setting on one task; means over the seeds that finished."""
+
+    setting: Setting
+    task: str
+    source: str
+    """Where the task's pre-grasp came from."""
+    seeds: dict[int, str]
+    """Seed to state."""
+    frames: int
+    """Fewest environment steps of a finished run; 0 if none has finished."""
+    success: float
+    success_mean_action: float
+    error: float
+    lifted: float
+    paper_success: float
+    paper_error: float
+    null: float
+    """Success if the object never moves."""
+    comparable: bool
+    """Whether the paper's figures were made the same way."""
+
+    @property
+    def difference(self) -> float:
+        """Success less the paper's."""
+        return self.success - self.paper_success
+
+    @property
+    def done(self) -> int:
+        """How many seeds have finished."""
+        return sum(state == "finished" for state in self.seeds.values())
+
+
+@dataclass(frozen=True)
+class Average:
+    """One setting over several tasks: the mean of the tasks' means."""
+
+    table: str
+    """``source``, ``ablation`` or ``baseline``."""
+    setting: Setting
+    name: str
+    """Row of the table: source of pre-grasps, ablation, or method."""
+    tasks: int
+    runs: int
+    success: Estimate
+    error: Estimate
+    rotation: Estimate
+    same: dict[str, float]
+    """The paper's figures of the same tasks, averaged: ``success`` and ``com_error``."""
+    paper: dict[str, float] = field(default_factory=dict)
+    """The paper's own average: ``success``, ``com_error``, and ``tasks`` where it says so."""
+    deviations: tuple[str, ...] = ()
+    """Why it cannot be set against the paper's."""
+
+
+def task_rows(results: Results, setting: Setting) -> list[TaskRow]:
+    """Return the table of one setting, a row a task."""
+    rows = []
+    comparable = not results.deviations(setting)
+    for task in results.tasks:
+        runs = results.cell(setting, task)
+        if not runs:
+            continue
+        done = [run for run in runs if run.finished]
+
+        def mean(metric: str, done: list[Run] = done) -> float:
+            return average(run.metric(metric) for run in done)
+
+        rows.append(
+            TaskRow(
+                setting=setting,
+                task=task,
+                source=str(runs[0].facts.get("pregrasp_source", "?")),
+                seeds=results.states(setting, task),
+                frames=min((run.frames for run in done), default=0),
+                success=mean(SUCCESS),
+                success_mean_action=mean(SUCCESS_MEAN),
+                error=mean(ERROR),
+                lifted=mean(LIFTED),
+                paper_success=known(runs[0], "paper_success"),
+                paper_error=known(runs[0], "paper_com_error"),
+                null=paper()["null_policy"].get(task, np.nan),
+                comparable=comparable,
+            )
+        )
+    return rows
+
+
+def by_source(results: Results) -> list[Average]:
+    """Return Table I: each setting with the plain method and pre-grasps, by their source."""
+    rows = []
+    for setting in results.settings:
+        plain = setting.method == "pgdm" and setting.option("ablation") == "none"
+        if plain and setting.with_pregrasp:
+            for source, figures in paper()["by_source"].items():
+                rows += _average(results, "source", setting, source, figures, _from(source))
+    return rows
+
+
+def by_ablation(results: Results) -> list[Average]:
+    """Return the ablations on tcdm30, and what each would be without; empty if there are none."""
+    ablated = [s for s in results.settings if s.option("ablation") != "none"]
+    rests = {setting.rest("ablation") for setting in ablated}
+    rows = []
+    for setting in results.settings:
+        if setting.rest("ablation") in rests:
+            name = setting.option("ablation")
+            figures = paper()["by_ablation"].get(name, {})
+            rows += _average(results, "ablation", setting, name, figures, _in_tcdm30, "ablation")
+    return rows
+
+
+def baselines(results: Results) -> list[Average]:
+    """Return methods with and without pre-grasps on tcdm30; empty if there is only one kind."""
+    settings = [s for s in results.settings if s.option("ablation") == "none"]
+    if len({(s.method, s.with_pregrasp) for s in settings}) < 2:
+        return []
+    rows = []
+    for setting in settings:
+        figures = paper()["by_ablation"]["none"]
+        plain = setting.method == "pgdm" and setting.with_pregrasp
+        name = f"{setting.method} {'with' if setting.with_pregrasp else 'without'} pre-grasp"
+        rows += _average(
+            *(results, "baseline", setting, name, figures if plain else {}, _in_tcdm30),
+            *(("method",) if setting.with_pregrasp else ("method", "pregrasp")),
+        )
+    return rows
+
+
+def aggregates(results: Results) -> dict[Setting, tuple[Estimate, list[Estimate], int, int]]:
+    """Return for each setting: interquartile mean, profile, tasks, runs; where any has finished."""
+    found = {}
+    for setting in results.settings:
+        scores = list(results.scores(setting).values())
+        if scores:
+            profile = statistics.profile(scores, THRESHOLDS)
+            count = sum(len(task) for task in scores)
+            found[setting] = statistics.iqm(scores), profile, len(scores), count
+    return found
+
+
+def improvements(results: Results) -> dict[tuple[Setting, Setting], tuple[Estimate, int]]:
+    """Return the probability that one setting beats another, and on how many shared tasks."""
+    found = {}
+    for a, b in combinations(results.settings, 2):
+        x, y = results.scores(a), results.scores(b)
+        shared = [task for task in x if task in y]
+        if shared:
+            args = [x[task] for task in shared], [y[task] for task in shared]
+            found[a, b] = statistics.improvement(*args), len(shared)
+    return found
+
+
+def _average(
+    results: Results,
+    table: str,
+    setting: Setting,
+    name: str,
+    figures: dict[str, float],
+    wanted: Callable[[Run], bool],
+    *groups: str,
+) -> Iterator[Average]:
+    """Give the row, if any run has finished."""
+    scores = results.scores(setting, SUCCESS, wanted)
+    if not scores:
+        return
+
+    def estimate(metric: str) -> Estimate:
+        values = list(results.scores(setting, metric, wanted).values())
+        return statistics.mean(values) if values else NOTHING
+
+    first = [results.cell(setting, task)[0] for task in scores]
+    yield Average(
+        table=table,
+        setting=setting,
+        name=name,
+        tasks=len(scores),
+        runs=sum(len(values) for values in scores.values()),
+        success=estimate(SUCCESS),
+        error=estimate(ERROR),
+        rotation=estimate(ROTATION),
+        same={
+            "success": average(known(run, "paper_success") for run in first),
+            "com_error": average(known(run, "paper_com_error") for run in first),
+        },
+        paper=figures,
+        deviations=tuple(results.deviations(setting, *groups)),
+    )
+
+
+def _from(source: str) -> Callable[[Run], bool]:
+    """Return what tells the tasks of a row of Table I; those beyond the paper's 50 are in none."""
+
+    def wanted(run: Run) -> bool:
+        own = run.facts.get("pregrasp_source")
+        return np.isfinite(known(run, "paper_success")) and source in ("all", own)
+
+    return wanted
+
+
+def _in_tcdm30(run: Run) -> bool:
+    return run.facts.get("tcdm30") is True

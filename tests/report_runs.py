@@ -1,0 +1,60 @@
+"""Finished runs of a few tasks and settings, to report on."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from PIL import Image
+
+from pgdm.config.store import compose_plain
+from pgdm.tracking import RunFolder, RunLog
+
+FRAMES = 40_960
+
+
+def make(
+    path: Path, success: float, *overrides: str, state: str = "finished", **changes: Any
+) -> RunFolder:
+    """Write a run whose last evaluation has a success, sampled; the mean action has 0.1 more.
+
+    Args:
+        path: its folder.
+        success: of the last of four evaluations; the first has none.
+        overrides: settings, as for ``pgdm-run``; the task must be one of them.
+        state: what ``result.json`` says; ``running`` has none.
+        changes: of top-level keys, whatever ``conf/`` knows of them.
+    """
+    config = compose_plain([f"total_frames={FRAMES}", "budget=smoke", *overrides]) | changes
+    (path / "videos").mkdir(parents=True)
+    (path / "config.yaml").write_text(yaml.safe_dump({"format": 1, **config}))
+    total, metrics = config["total_frames"], {}
+    log = RunLog(path / "metrics.jsonl")
+    for i in range(5):
+        place = {"frames": total * i // 4, "iteration": i, "time_s": float(i)}
+        log.append({"train/return": 10.0 * i, "train/kl": 0.1}, kind="train", **place)
+        metrics = evaluation(success * i / 4)
+        log.append(metrics, kind="eval", **place)
+    film = path / "videos" / f"frames_{total:012d}.mp4"
+    film.write_bytes(b"film")
+    Image.fromarray(np.full((48, 64, 3), 90, np.uint8)).save(film.with_suffix(".png"))
+    result = {"status": state, "frames": total, "metrics": metrics, "git": "0123abc"}
+    result |= {"pregrasp_used": config["pregrasp"]["source"], "versions": {"mujoco": "4.0.0"}}
+    result |= {"error": "the disk is full"} if state == "failed" else {}
+    if state != "running":
+        (path / "result.json").write_text(json.dumps(result))
+    return RunFolder(path)
+
+
+def evaluation(success: float) -> dict[str, float]:
+    """Return an evaluation's metrics; the errors follow from the success."""
+    found = {}
+    for kind, more in (("sampled", 0.0), ("deterministic", 0.1)):
+        named = {"success": success + more, "com_error_released": 1e-2 * math.exp(-success)}
+        named |= {"ori_error": 1.0 - success, "lifted": 0.5, "return": 3.0}
+        found |= {f"eval_{kind}/{name}": value for name, value in named.items()}
+    return found
