@@ -109,7 +109,8 @@ def plot(found: list[dict[str, Any]], path: Path) -> None:
         for row, name in enumerate(names):
             axis = axes[row][column]
             for r in (r for r in found if r["task"] == task):
-                axis.plot(r["curve_frames"], r["curves"][name], label=r["setting"])
+                color = f"C{list(SETTINGS).index(r['setting'])}"
+                axis.plot(r["curve_frames"], r["curves"][name], color, label=r["setting"])
             axis.set_title(task if row == 0 else "")
             axis.set_ylabel(name.split("/")[1] if column == 0 else "")
             axis.set_xlim(0, FRAMES)

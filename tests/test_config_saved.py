@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from pgdm.config.identity import identity
@@ -30,6 +30,7 @@ numbers = st.floats(min_value=1e-12, max_value=1e12)
 
 
 @given(numbers, numbers, st.text(min_size=1).filter(str.strip))
+@example(1.0, 1.0, "a\x85b\u2028")  # line breaks to YAML, unless they are escaped
 def test_numbers_and_text_survive_to_the_bit(rate: float, scale: float, text: str) -> None:
     cfg = compose()
     algo = dataclasses.replace(cfg.algo, learning_rate=rate)

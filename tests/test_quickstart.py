@@ -19,8 +19,9 @@ def test_the_quickstart_learns_to_swing_the_hammer(library_home: Path, tmp_path:
     run = tmp_path / "run"
     result = json.loads((run / "result.json").read_text())
     reached = result["metrics"]
-    assert reached["eval_deterministic/lifted"] >= 0.95
-    assert reached["eval_deterministic/length"] == 85
-    assert reached["eval_deterministic/com_error"] <= 0.06  # m
-    assert reached["eval_deterministic/success"] >= 0.1
+    # Well below what was measured: a run depends on the processor's rounding.
+    assert reached["eval_deterministic/lifted"] >= 0.9
+    assert reached["eval_deterministic/length"] >= 80
+    assert reached["eval_deterministic/com_error"] <= 0.1  # m
+    assert reached["eval_deterministic/return"] >= 200  # 17 before training
     assert (run / result["video"]).stat().st_size > 10_000

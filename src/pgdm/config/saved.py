@@ -31,7 +31,7 @@ def save_config(cfg: ExperimentCfg, run_dir: str | os.PathLike[str]) -> Path:
     """
     file = Path(run_dir) / FILE
     plain = {"format": FORMAT} | dataclasses.asdict(cfg)
-    text = _HEADER + yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=100)
+    text = _HEADER + yaml.safe_dump(plain, sort_keys=False, width=100)
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(f".{FILE}.{os.getpid()}.part")
     try:
