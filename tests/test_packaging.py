@@ -59,7 +59,11 @@ def imported_packages() -> set[str]:
                 names |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names.add(node.module)
-    return {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"pgdm", "hydra_plugins"}
+    return (
+        {name.split(".")[0] for name in names}
+        - set(sys.stdlib_module_names)
+        - {"pgdm", "hydra_plugins"}
+    )
 
 
 def test_what_is_imported_is_declared_and_the_reverse() -> None:
