@@ -159,7 +159,7 @@ def test_the_walk_leaves_what_readme_says(walked: tuple[Path, dict]) -> None:
     folder, printed = walked
     assert "cup" in printed["pgdm runs"]
     assert (folder / "cup.mp4").stat().st_size > 10_000
-    assert len(list((folder / "runs").glob("*/pgdm/*/result.json"))) == 6
+    assert len(list((folder / "runs" / "sweeps").glob("*/runs/*/result.json"))) == 6
 
 
 @pytest.fixture

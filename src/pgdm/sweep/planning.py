@@ -62,8 +62,8 @@ def _names(composed: Sequence[Composed]) -> list[str]:
         {key.lstrip("+"): value for key, _, value in (o.partition("=") for o in overrides)}
         for overrides, _ in composed
     ]
-    keys = {key: None for one in given for key in one}
-    varied = [key for key in keys if len({one.get(key) for one in given}) > 1]
+    typed = dict.fromkeys(key for one in given for key in one)
+    varied = [key for key in typed if len({one.get(key) for one in given}) > 1]
     others = [key for key in varied if key.partition(".")[0] not in NOT_IN_A_NAME]
     names = []
     for one, (_, settings) in zip(given, composed, strict=True):
