@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from command_line import TINY, Outcome, command
-from pgdm.sweep.plan import Plan, read_plan
+from pgdm.sweep.plan import Plan, read_plan, record
 
 SMALL = ("-m", "--dry-run", "budget=smoke")
 
@@ -23,9 +23,15 @@ def shown(outcome: Outcome) -> dict[str, str]:
 
 
 def started(monkeypatch: pytest.MonkeyPatch) -> list[Plan]:
-    """Have sweeps noted instead of run."""
+    """Have sweeps noted, and recorded, instead of run."""
     plans: list[Plan] = []
-    monkeypatch.setattr("pgdm.cli.plan.run_sweep", lambda plan, *_: plans.append(plan) or 0)
+
+    def note(plan: Plan, *_: object) -> int:
+        record(plan)
+        plans.append(plan)
+        return 0
+
+    monkeypatch.setattr("pgdm.cli.plan.run_sweep", note)
     return plans
 
 

@@ -84,7 +84,7 @@ def test_status_needs_neither_torch_nor_mlflow(ended: Path) -> None:
 def test_watching_what_has_ended(ended: Path) -> None:
     outcome = sweep("watch", ended)
     assert outcome.code == 1
-    assert "failed: seed=1 (attempt 1): no room" in outcome.out
+    assert "failed: seed=1 (attempt 1), log: " in outcome.out
     assert "  | error: no room" in outcome.out
 
 

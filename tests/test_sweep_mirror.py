@@ -35,15 +35,15 @@ MIRRORED = ("tracking=mlflow", "tracking.experiment=other")
 @pytest.fixture
 def whole(tmp_path: Path, empty_database: Path) -> Plan:
     """Return a planned sweep of two jobs, with an empty database beside it."""
-    shutil.copy(empty_database, tmp_path / "mlflow.db")
     made = plan(tmp_path / "study", 2, *MIRRORED)
     write_plan(made)
+    shutil.copy(empty_database, made.folder / "mlflow.db")
     return made
 
 
-def runs(tmp_path: Path) -> dict[str, tuple[str, str | None]]:
+def runs(folder: Path) -> dict[str, tuple[str, str | None]]:
     """Return status and parent of each run by its folder."""
-    store = Store.open(store_uri(tmp_path), "other")
+    store = Store.open(store_uri(folder), "other")
     found = store.client.search_runs([store.experiment_id])
     assert len({run.data.tags["run_dir"] for run in found}) == len(found)
     tags = {run.info.run_id: run.data.tags for run in found}
@@ -70,13 +70,13 @@ def test_a_sweep_is_one_run_however_often_it_is_opened(whole: Plan, tmp_path: Pa
     ):
         mirror = SweepMirror.of(whole, tell)
         mirror.open(whole)
-        assert runs(tmp_path) == {"study": ("RUNNING", None)}
+        assert runs(whole.folder) == {"study": ("RUNNING", None)}
         assert read_json(whole.folder / LINK)["status"] == "running"
         mirror.close(status)
-        assert runs(tmp_path) == {"study": (shown, None)}
+        assert runs(whole.folder) == {"study": (shown, None)}
     (whole.folder / LINK).unlink()
     SweepMirror.of(whole, tell).open(whole)
-    assert len(runs(tmp_path)) == 1
+    assert len(runs(whole.folder)) == 1
 
 
 def test_jobs_are_shown_below_it(whole: Plan, tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_jobs_are_shown_below_it(whole: Plan, tmp_path: Path) -> None:
     end(folder)
     tracker.finish("finished")
     # In the sweep's store, though by itself the run would go to one beside its own folder.
-    assert runs(tmp_path) == {"study": ("RUNNING", None), "s0": ("FINISHED", "study")}
+    assert runs(whole.folder) == {"study": ("RUNNING", None), "s0": ("FINISHED", "study")}
     assert not (whole.folder / "runs" / "mlflow.db").exists()
 
 
@@ -104,7 +104,7 @@ def test_a_killed_job_gets_its_true_status(
     mirror.adopt(whole.jobs[0])
     tracker = open_tracker(TrackingCfg("mlflow", None, "other"), folder, {})
     limit = time.monotonic() + 60
-    while "s0" not in runs(tmp_path) or "run_id" not in folder.link:
+    while "s0" not in runs(whole.folder) or "run_id" not in folder.link:
         assert time.monotonic() < limit
         time.sleep(0.1)
     tracker._pool.shutdown()  # type: ignore[attr-defined] # as if it was killed here
@@ -112,11 +112,11 @@ def test_a_killed_job_gets_its_true_status(
     if status == "finished":
         end(folder)
     mirror.correct(folder.path)
-    assert runs(tmp_path)["s0"] == (shown, "study")
-    assert [done.action for done in sync(tmp_path)] == [
+    assert runs(whole.folder)["s0"] == (shown, "study")
+    assert [done.action for done in sync(whole.folder)] == [
         "unchanged" if status == "finished" else "completed"
     ]
-    assert runs(tmp_path)["s0"] == (shown, "study")
+    assert runs(whole.folder)["s0"] == (shown, "study")
 
 
 def test_status_tells_mlflow_that_a_sweep_was_killed(whole: Plan, tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_status_tells_mlflow_that_a_sweep_was_killed(whole: Plan, tmp_path: Path
     ways = {"KILLED": ("sweep", "status", str(whole.folder)), "FINISHED": ("runs", "sync")}
     for expected, way in ways.items():
         assert command("pgdm", *way).code == 0
-        assert runs(tmp_path) == {"study": (expected, None)}
+        assert runs(whole.folder) == {"study": (expected, None)}
         SweepMirror.of(whole, tell).open(whole)
         for key in ledger.states():
             number = ledger.begin(key, Process.of(os.getpid()))
@@ -162,15 +162,15 @@ def test_kills_leave_no_run_twice_and_none_running(library_home: Path, tmp_path:
         sweep.kill()
         sweep.communicate()
         assert command("pgdm", "sweep", "status", str(whole.folder)).code == 0
-        assert "RUNNING" not in {status for status, _ in runs(tmp_path).values()}
+        assert "RUNNING" not in {status for status, _ in runs(whole.folder).values()}
     sweep = start(whole.folder)
     _, err = sweep.communicate(timeout=300)
     assert sweep.returncode == 0, err
-    assert runs(tmp_path) == {
+    assert runs(whole.folder) == {
         "study": ("FINISHED", None),
         "s0": ("FINISHED", "study"),
         "s1": ("FINISHED", "study"),
     }
-    counts = [done.action for done in sync(tmp_path)]
+    counts = [done.action for done in sync(whole.folder)]
     assert counts == ["unchanged"] * 2
     assert RunFolder(whole.folder / "runs" / "s0").status() == "finished"

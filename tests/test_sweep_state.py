@@ -152,8 +152,11 @@ def test_failures_show_the_end_of_the_log(tmp_path: Path) -> None:
     log = tmp_path / "a.log"
     log.write_text("".join(f"line {i}\n" for i in range(100)))
     text = failures([row("finished", 1), row("failed", 1, log=log, error="no room", attempts=3)])
-    assert "failed: seed=0 (attempt 3): no room" in text
-    assert str(log) in text and "line 99" in text and "line 50\n" not in text
+    table, _, end = text.partition("failed: seed=0 (attempt 3), log: ")
+    words = "1 failed job attempts frames error seed=0 3 1 no room"
+    assert table.split() == words.split()
+    assert end.splitlines()[0] == str(log)
+    assert "line 99" in text and "line 50\n" not in text
     assert failures([row("finished", 1)]) == ""
 
 

@@ -15,7 +15,7 @@ from pgdm.config.strict import build
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.sweep.estimate import Estimate, estimate
 from pgdm.sweep.local import run_sweep
-from pgdm.sweep.plan import LocalCfg, Plan, SweepCfg, check_fits, record
+from pgdm.sweep.plan import LocalCfg, Plan, SweepCfg, check_fits
 from pgdm.sweep.planning import make_plan
 
 _LAUNCHERS = ("local",)
@@ -44,7 +44,6 @@ def run_planned(composed: Composed, name: str, command: str) -> int:
     if sweep.dry_run:
         print("nothing was started (sweep.dry_run)")
         return 0
-    record(plan)
     return run_sweep(plan, sweep, launcher, notify)
 
 

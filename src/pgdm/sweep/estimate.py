@@ -8,7 +8,9 @@ from statistics import median
 from typing import Any
 
 from pgdm.errors import RunError
+from pgdm.sweep.ledger import FINISHED
 from pgdm.sweep.plan import Job, Plan
+from pgdm.sweep.state import stand
 from pgdm.tracking.run_folder import RESULT, RunFolder, find_runs, read_json
 
 ASSUMED_STEPS_PER_S = 1_000.0
@@ -59,15 +61,12 @@ def estimate(plan: Plan, root: Path) -> Estimate:
 
 def _frames_done(job: Job) -> int:
     """Return how far a job is; at most its last frame but one as long as it has not ended well."""
-    folder = RunFolder(Path(job.cfg.run_dir))
     total = job.cfg.total_frames
-    if folder.result.get("status") == "finished":
-        return int(folder.result.get("frames", 0))
     try:
-        lines = folder.log.tail()
+        found = stand(Path(job.cfg.run_dir), total)
     except RunError:  # starting it will tell
         return 0
-    return min(int(lines[-1]["frames"]), total - 1) if lines else 0
+    return total if found.state == FINISHED else min(found.frames or 0, total - 1)
 
 
 def _speeds(plan: Plan, root: Path) -> list[float]:

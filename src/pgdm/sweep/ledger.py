@@ -142,16 +142,23 @@ class Ledger:
 
     def begin(self, key: str, process: Process) -> int:
         """Note that an attempt begins, and return its number."""
-        self._write(
-            "INSERT INTO attempts (key, number, state, host, pid, born, start) "
-            "SELECT ?1, coalesce(max(number), 0) + 1, 'running', ?2, ?3, ?4, ?5 "
-            "FROM attempts WHERE key = ?1",
-            [(key, process.host, process.pid, process.born, time.time())],
+
+        def work(db: sqlite3.Connection) -> int:
+            db.execute("BEGIN IMMEDIATE")
+            ((number,),) = db.execute(
+                "INSERT INTO attempts (key, number, state, host, pid, born, start) "
+                "SELECT ?1, coalesce(max(number), 0) + 1, 'running', ?2, ?3, ?4, ?5 "
+                "FROM attempts WHERE key = ?1 RETURNING number",
+                (key, process.host, process.pid, process.born, time.time()),
+            ).fetchall()
             # Cancelled in this moment: its driver sees that, and stops it again.
-            ("UPDATE jobs SET state = 'running' WHERE key = ? AND state != 'cancelled'", (key,)),
-        )
-        ((number,),) = self._read("SELECT max(number) FROM attempts WHERE key = ?", (key,))
-        return number
+            db.execute(
+                "UPDATE jobs SET state = 'running' WHERE key = ? AND state != 'cancelled'", (key,)
+            )
+            db.execute("COMMIT")
+            return number
+
+        return self._do(work)
 
     def register(self, key: str, number: int, process: Process) -> bool:
         """Note which process works on an attempt; false if it has been given up meanwhile."""
@@ -212,20 +219,13 @@ class Ledger:
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         return self._do(lambda db: db.execute(query, values).fetchall())
 
-    def _write(
-        self,
-        query: str,
-        rows: Iterable[tuple[Any, ...]],
-        then: tuple[str, tuple[Any, ...]] | None = None,
-    ) -> int:
-        """Do a query for each row, then another one, all or nothing; return the rows changed."""
+    def _write(self, query: str, rows: Iterable[tuple[Any, ...]]) -> int:
+        """Do a query for each row, all or nothing; return the rows changed."""
         wanted = list(rows)
 
         def work(db: sqlite3.Connection) -> int:
             db.execute("BEGIN IMMEDIATE")
             changed = db.executemany(query, wanted).rowcount
-            if then is not None:
-                db.execute(*then)
             db.execute("COMMIT")
             return changed
 

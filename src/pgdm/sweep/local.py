@@ -18,7 +18,7 @@ from pgdm.errors import ConfigError, SweepError
 from pgdm.stop import StopRequest
 from pgdm.sweep.driver import Driver, Room
 from pgdm.sweep.ledger import Ledger
-from pgdm.sweep.plan import FILE, LocalCfg, Plan, SweepCfg, write_plan
+from pgdm.sweep.plan import LocalCfg, Plan, SweepCfg, record
 from pgdm.sweep.state import LOGS, parent
 from pgdm.tracking.run_folder import read_json, write_json
 
@@ -70,12 +70,12 @@ def run_sweep(plan: Plan, sweep: SweepCfg, launcher: LocalCfg, notify: Notify) -
         notify: told in a sentence what people should know.
 
     Raises:
-        SweepError: if another process is at it, or the folder cannot be used.
+        SweepError: if another process is at it, the folder holds a sweep with other settings, or
+            cannot be used.
     """
     plan.folder.joinpath(LOGS).mkdir(parents=True, exist_ok=True)
     with held(plan):
-        if not (plan.folder / FILE).exists():
-            write_plan(plan)
+        record(plan)
         write_json(plan.folder / LAUNCH, {"sweep": asdict(sweep), "launcher": asdict(launcher)})
         if not sweep.detach:
             shared = room(plan, launcher, len(os.sched_getaffinity(0)), free_memory_gb())

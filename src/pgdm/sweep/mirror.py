@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pgdm import paths
 from pgdm.errors import TrackingError
 from pgdm.sweep.ledger import RUNNING
 from pgdm.tracking.run_folder import LINK, read_json
@@ -36,12 +37,14 @@ class SweepMirror:
             return cls(None, notify)
         from pgdm.tracking.group import Group
         from pgdm.tracking.mlflow import sqlite_file, store_uri
-        from pgdm.tracking.run_folder import runs_root
 
         known = read_json(plan.folder / LINK).get("uri", "")
         file = sqlite_file(known)
         stays = known and (file is None or file.exists())
-        uri = chosen.uri or (known if stays else store_uri(runs_root(plan.folder)))
+        # Among all runs if the sweep lies there, otherwise in its own folder.
+        runs = paths.runs().absolute()
+        here = store_uri(runs if plan.folder.is_relative_to(runs) else plan.folder)
+        uri = chosen.uri or (known if stays else here)
         return cls(Group(plan.folder, uri, chosen.experiment), notify)
 
     @classmethod

@@ -30,7 +30,7 @@ class SweepCfg:
     dir: str | None
     """Folder of the sweep; None is ``runs/sweeps/<name>``."""
     max_attempts: int
-    """How often a job may be started before it counts as failed for good."""
+    """How often a job is tried, each time the sweep is started, before it counts as failed."""
     detach: bool
     """Go on in the background, and return at once."""
     dry_run: bool
@@ -92,9 +92,8 @@ def record(plan: Plan) -> None:
     Raises:
         SweepError: as ``check_fits``.
     """
-    keys = {job.key for job in plan.jobs}
-    others = tuple(job for job in check_fits(plan) if job.key not in keys)
-    write_plan(dataclasses.replace(plan, jobs=(*others, *plan.jobs)))
+    jobs = {job.key: job for job in (*check_fits(plan), *plan.jobs)}
+    write_plan(dataclasses.replace(plan, jobs=tuple(jobs.values())))
 
 
 def check_fits(plan: Plan) -> tuple[Job, ...]:

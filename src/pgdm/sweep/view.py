@@ -22,6 +22,7 @@ PLAIN_INTERVAL_S = 30.0
 _REFRESH_S = 2.0
 _TAIL_LINES = 15
 _UNKNOWN = "-"
+_WIDE = 120
 
 
 class SweepView:
@@ -99,18 +100,30 @@ def span(seconds: float) -> str:
 
 
 def failures(found: Sequence[Row]) -> str:
-    """Return the failed jobs with the end of each log; empty if there are none."""
-    parts = []
-    for row in found:
-        if row.state != FAILED:
-            continue
-        parts.append(
-            f"\nfailed: {row.name} (attempt {row.attempts}): {row.error}\n  log: {row.log}"
-        )
+    """Return the failed jobs as a table, then the end of each log; empty if there are none."""
+    failed = [row for row in found if row.state == FAILED]
+    if not failed:
+        return ""
+    table = Table(box=None, title=f"{len(failed)} failed", title_justify="left")
+    for head in ("job", "attempts", "frames", "error"):
+        table.add_column(head, overflow="fold")
+    for row in failed:
+        error = escape(row.error or "")
+        table.add_row(escape(row.name), str(row.attempts), f"{row.frames:,}", error)
+    parts = ["", _as_text(table)]
+    for row in failed:
+        parts.append(f"failed: {row.name} (attempt {row.attempts}), log: {row.log}")
         if row.log is not None and row.log.exists():
             lines = row.log.read_text(errors="replace").splitlines()[-_TAIL_LINES:]
             parts += [f"  | {line}" for line in lines]
     return "\n".join(parts)
+
+
+def _as_text(table: Table) -> str:
+    console = Console(width=_WIDE)
+    with console.capture() as capture:
+        console.print(table)
+    return "\n".join(line.rstrip() for line in capture.get().splitlines())
 
 
 def percent(value: float | None) -> str:

@@ -70,12 +70,7 @@ class RunLog:
         Raises:
             RunError: if the file exists but cannot be read.
         """
-        try:
-            raw = self.path.read_bytes()
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-        except OSError as error:
-            raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
+        raw = self._raw()
         kept: dict[tuple[str, int], Record] = {}
         lines = raw.split(b"\n")
         for number, line in enumerate(lines[:-1], start=1):  # the last has no newline: unfinished
@@ -94,17 +89,20 @@ class RunLog:
         Raises:
             RunError: if the file exists but cannot be read.
         """
+        lines = self._raw(size_bytes).split(b"\n")[:-1]  # the first may be the end of a line
+        return [record for line in lines if (record := _parse(line))]
+
+    def _raw(self, last_bytes: int | None = None) -> bytes:
+        """Return the file, or the end of it; nothing if there is none."""
         try:
             with open(self.path, "rb") as file:
-                size = file.seek(0, os.SEEK_END)
-                file.seek(max(0, size - size_bytes))
-                lines = file.read().split(b"\n")[:-1]
+                if last_bytes is not None:
+                    file.seek(max(0, file.seek(0, os.SEEK_END) - last_bytes))
+                return file.read()
         except (FileNotFoundError, NotADirectoryError):
-            return []
+            return b""
         except OSError as error:
             raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
-        whole = lines if size <= size_bytes else lines[1:]
-        return [record for line in whole if (record := _parse(line))]
 
     def thinned(self, points: int) -> list[Record]:
         """Return every evaluation, and about ``points`` of the other lines, evenly spread.
@@ -114,12 +112,7 @@ class RunLog:
         Raises:
             RunError: if the file exists but cannot be read.
         """
-        try:
-            raw = self.path.read_bytes()
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-        except OSError as error:
-            raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
+        raw = self._raw()
         starts = {raw.rfind(b"\n", 0, len(raw) * i // points) + 1 for i in range(points)}
         at = raw.find(_EVALUATION)
         while at >= 0:
