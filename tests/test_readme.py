@@ -31,6 +31,8 @@ QUICK = (
     "pgdm tasks",
     "pgdm assets list",
     "pgdm assets show cup-pour1",
+    "pgdm-run -m task=tcdm30 seed=0,1,2 --dry-run",
+    "pgdm-run +sweep=validate_tcdm50 budget=smoke --dry-run",
 )
 
 # Run here, in this order and in one folder, with a smaller budget: command -> what is run.
@@ -42,10 +44,12 @@ WALK = {
     "pgdm eval runs/cup --video": "pgdm eval runs/cup --video --episodes 2",
     "pgdm runs": "pgdm runs",
     "pgdm view cup-pour1 --video cup.mp4": "pgdm view cup-pour1 --video cup.mp4",
-    "pgdm-run -m task=cup-pour1,duck-lift seed=0,1,2 total_frames=1_000_000": (
+    "pgdm-run -m task=cup-pour1,duck-lift seed=0,1,2 total_frames=1_000_000 sweep.name=lifts": (
         "pgdm-run -m task=cup-pour1,duck-lift seed=0,1,2 total_frames=4096 eval.episodes=1 "
-        "eval.video=false tracking=none"
+        "eval.video=false tracking=none sweep.name=lifts"
     ),
+    "pgdm sweep status runs/sweeps/lifts": "pgdm sweep status runs/sweeps/lifts",
+    "pgdm report runs/sweeps/lifts": "pgdm report runs/sweeps/lifts",
 }
 
 # Each has a test of its own below.
