@@ -176,7 +176,7 @@ def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
 
 def test_what_a_killed_writer_left_is_cleaned_up(tmp_path: Path) -> None:
     folder = saved(tmp_path, 1)
-    stale = folder.folder / "frames_000000000002.ckpt.123.tmp"
+    stale = folder.folder / ".tmp-123-frames_000000000002.ckpt"
     stale.write_bytes(b"half")
     assert folder.latest() == {"frames": 1}
     folder.save({"frames": 2}, 2)

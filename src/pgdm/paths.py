@@ -1,9 +1,14 @@
-"""Where things are kept."""
+"""Where things are kept, and how a file there is replaced."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
+
+TEMPORARY = ".tmp-"
+"""How the names of unfinished files begin."""
 
 
 def home() -> Path:
@@ -28,3 +33,32 @@ def downloads() -> Path:
 def runs() -> Path:
     """Return the default folder of runs: ``runs`` under the working directory."""
     return Path.cwd() / "runs"
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a name to write to; what was written takes the place of ``path``, whole or not at all.
+
+    Whoever looks sees the old file or the new one, also after a loss of power.
+
+    Raises:
+        OSError: if the file cannot be written; the old one is untouched.
+    """
+    # Its ending stays: libraries tell a format by it.
+    temp = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
+    try:
+        yield temp
+        _sync(temp)
+        os.replace(temp, path)
+        _sync(path.parent)  # the folder's own entry must reach the disk too
+    finally:
+        with contextlib.suppress(OSError):
+            temp.unlink()
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
-import os
 import pickle
 import shutil
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any
 import torch
 
 from pgdm.errors import CheckpointError
+from pgdm.paths import TEMPORARY, replacing
 
 _MAGIC = b"pgdm-checkpoint-1"
 _FOOTER_SIZE = len(_MAGIC) + hashlib.sha256().digest_size
@@ -120,20 +120,14 @@ def write_checkpoint(path: Path, state: State) -> None:
             holds something else than tensors and plain values.
     """
     payload = _encode(state)
-    temp = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for stale in path.parent.glob("*.tmp"):  # left behind by a process that was killed
+        for stale in path.parent.glob(f"{TEMPORARY}*"):  # left behind by a process that was killed
             stale.unlink(missing_ok=True)
-        with open(temp, "wb") as file:
+        with replacing(path) as temp, open(temp, "wb") as file:
             file.write(payload)
             file.write(_MAGIC + hashlib.sha256(payload).digest())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temp, path)
-        _sync_folder(path.parent)
     except OSError as error:
-        _remove(temp)
         raise CheckpointError(
             f"cannot write a checkpoint of {len(payload) / 1e6:.1f} MB to {path.parent} "
             f"({_free_space(path.parent)}): {error.strerror or error}; make room or give write "
@@ -180,27 +174,11 @@ def _encode(state: State) -> bytes:
     return buffer.getvalue()
 
 
-def _sync_folder(folder: Path) -> None:
-    """Make a rename last: the folder's own entry must reach the disk too."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _set_aside(path: Path) -> None:
     try:
         path.rename(path.with_suffix(".damaged"))
     except OSError as error:
         _log.warning("cannot rename %s: %s", path, error.strerror)
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        _log.warning("cannot remove %s: %s", path, error.strerror)
 
 
 def _free_space(folder: Path) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import weakref
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ import mujoco
 import numpy as np
 
 from pgdm.errors import RenderError
+from pgdm.paths import replacing
 from pgdm.sim.camera import camera_for
 from pgdm.sim.gl import context_class
 
@@ -252,17 +252,13 @@ def write_image(path: Path, picture: np.ndarray) -> Path:
 @contextlib.contextmanager
 def _replacing(path: Path) -> Iterator[Path]:
     """Give a name to write to; what was written takes the place of ``path`` in one step."""
-    temp = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temp.touch()  # a folder that cannot be written is found before ffmpeg starts
-        yield temp
-        os.replace(temp, path)
+        with replacing(path) as temp:
+            temp.touch()  # a folder that cannot be written is found before ffmpeg starts
+            yield temp
     except (OSError, RuntimeError) as error:
         raise RenderError(f"cannot write {path}: {error}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temp.unlink()
 
 
 def _even(frame: np.ndarray) -> np.ndarray:

@@ -238,12 +238,8 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a JSON object, whole or not at all."""
-    temp = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with paths.replacing(path) as temp:
         temp.write_text(json.dumps(content, indent=1) + "\n")
-        os.replace(temp, path)
-    finally:
-        temp.unlink(missing_ok=True)
 
 
 def _walk(root: Path) -> Iterator[Path]:

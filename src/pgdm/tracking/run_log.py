@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pgdm.errors import RunError
+from pgdm.paths import replacing
 
 FILE_NAME = "metrics.jsonl"
 HEADER = ("frames", "iteration", "time_s", "kind")
@@ -143,15 +144,10 @@ class RunLog:
         whole = [line for line in lines if (r := _parse(line)) and int(r["frames"]) <= frames]
         if len(whole) == len(lines):
             return 0
-        temp = self.path.with_name(self.path.name + ".tmp")
         try:
-            with open(temp, "wb") as file:
-                file.writelines(line + b"\n" for line in whole)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temp, self.path)
+            with replacing(self.path) as temp:
+                temp.write_bytes(b"".join(line + b"\n" for line in whole))
         except OSError as error:
-            temp.unlink(missing_ok=True)
             raise RunError(f"cannot write {self.path}: {error.strerror or error}") from error
         return len(lines) - len(whole)
 
