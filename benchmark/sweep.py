@@ -1,10 +1,11 @@
-"""What looking after a sweep costs: its ledger, MLflow, and `pgdm sweep status` on 150 jobs.
+"""What a sweep costs: planning it, its ledger, MLflow, and `pgdm sweep status` on 150 jobs.
 
     python benchmark/sweep.py [--task hammer-use1] [--write]
 
-The sweep of 150 jobs is made up, with two attempts at each and full-size records; its figures are
-medians of five. Shares are of processor time: the driver's of one core, MLflow's of a training of
-a few iterations on one thread, where the thread that talks to MLflow is timed by itself.
+The plan is that of the study validate_tcdm50, a process from start to end. The sweep whose status
+is asked for is made up, with two attempts at each job and full-size records. Figures are medians of
+five. Shares are of processor time: the driver's of one core, MLflow's of a training of a few
+iterations on one thread, where the thread that talks to MLflow is timed by itself.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ import json
 import os
 import platform
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -113,6 +116,18 @@ def status_s(folder: Path) -> float:
     return median_s(status)
 
 
+def planning_s() -> float:
+    """Measure a dry run of the 150 jobs of a study, the start of Python and Hydra included."""
+    program = Path(sys.executable).with_name("pgdm-run")
+
+    def plan() -> None:
+        command = [str(program), "+sweep=validate_tcdm50", "--dry-run"]
+        printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        assert f"{JOBS} (" in printed, printed
+
+    return median_s(plan)
+
+
 @contextlib.contextmanager
 def timed_mlflow(spent: dict[str, float]) -> Iterator[None]:
     """Add up the processor time of each method that talks to MLflow, s."""
@@ -191,6 +206,7 @@ def main() -> None:
         made_up(root / "two", 2)
         made_up(root / "all", JOBS)
         figures = {
+            "planning_150_s": planning_s(),
             "status_of_150_s": status_s(root / "two"),
             "status_of_150_running_s": status_s(root / "all"),
             **ledger_costs(root / "two"),
