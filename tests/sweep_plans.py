@@ -43,7 +43,7 @@ import sys
 from pathlib import Path
 from typing import IO
 from pgdm.cli.train import notify
-from pgdm.sweep.local import run_sweep
+from pgdm.sweep.launch import run_sweep
 from pgdm.sweep.plan import read_plan
 import sweep_plans
 plan = read_plan(Path(sys.argv[1]))

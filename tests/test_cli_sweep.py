@@ -115,7 +115,7 @@ from pathlib import Path
 from dataclasses import replace
 import sweep_plans
 from pgdm.cli.train import notify
-from pgdm.sweep.local import run_sweep
+from pgdm.sweep.launch import run_sweep
 plan = sweep_plans.plan(Path("study").absolute(), 3, *sys.argv[1:])
 sys.exit(run_sweep(plan, replace(sweep_plans.SWEEP, detach=True), sweep_plans.LOCAL, notify))
 """

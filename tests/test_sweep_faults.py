@@ -16,6 +16,7 @@ import pytest
 
 from pgdm.sweep.ledger import FILE, Ledger
 from pgdm.sweep.plan import write_plan
+from pgdm.sweep.queue import Queue
 from pgdm.sweep.state import rows, works
 from pgdm.tracking.run_folder import read_json
 from pgdm.tracking.run_log import RunLog
@@ -54,7 +55,7 @@ def metrics(folder: Path, seed: int) -> list[dict[str, str]]:
 
 def kill_workers(folder: Path) -> None:
     for entry in Ledger(folder).entries():
-        if entry.last is not None and works(entry.last, entry.run_dir):
+        if entry.last is not None and works(entry.last, entry.run_dir, Queue()):
             entry.last.process.signal(signal.SIGKILL)
 
 

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pgdm.sweep.driver import Room
 from pgdm.sweep.ledger import Ending, Ledger
-from pgdm.sweep.local import free_memory_gb, room
+from pgdm.sweep.local import Room, free_memory_gb, room
 from pgdm.sweep.processes import Process
 from pgdm.sweep.state import PARENT, Row, log_path, parent, rows, settle, stand, summarize
 from pgdm.sweep.view import failures, live_table, span, summary_line
@@ -99,7 +98,7 @@ def test_who_drives(tmp_path: Path) -> None:
 def row(state: str, frames: int, pace: float | None = None, **changes: object) -> Row:
     whole = {"key": "k", "name": "seed=0", "state": state, "attempts": 1, "frames": frames}
     whole |= {"total_frames": 100, "success": None, "steps_per_s": None, "frames_per_s": pace}
-    whole |= {"left_s": None, "run_dir": Path(), "log": None, "error": None}
+    whole |= {"left_s": None, "run_dir": Path(), "log": None, "error": None, "slurm": None}
     return Row(**(whole | changes))  # type: ignore[arg-type]
 
 

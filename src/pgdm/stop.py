@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first asks the run to stop at a safe point, the second ends it."""
+"""Signals that ask a run to stop: the first at a safe point, the second at once."""
 
 from __future__ import annotations
 
@@ -6,14 +6,23 @@ import signal
 import sys
 from types import FrameType, TracebackType
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
+STOPPED = tuple(128 + number for number in _SIGNALS)
+"""Exit codes of what has stopped because it was asked to, as a shell tells them."""
+
 
 class StopRequest:
     """Within ``with``, a signal sets a flag that the trainer looks at between iterations.
 
-    Outside the main thread Python refuses signal handlers; the flag then stays unset.
+    Ctrl-C, SIGTERM, and SIGUSR2, which Slurm sends before a job's time is up. Outside the main
+    thread Python refuses signal handlers; the flag then stays unset.
+
+    Args:
+        patient: whether further signals change nothing: Slurm sends several, and SIGKILL last.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, patient: bool = False) -> None:
+        self._patient = patient
         self.signal: int | None = None
         """The signal that came, if any."""
         self._before: dict[int, signal._HANDLER] = {}
@@ -24,11 +33,11 @@ class StopRequest:
 
     @property
     def exit_code(self) -> int:
-        """The shell's code for a process that was stopped by this signal: 130 or 143."""
+        """The shell's code for a process that was stopped by this signal, one of ``STOPPED``."""
         return 128 + (self.signal or signal.SIGINT)
 
     def __enter__(self) -> StopRequest:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in _SIGNALS:
             try:
                 self._before[number] = signal.signal(number, self._on_signal)
             except ValueError:
@@ -47,10 +56,11 @@ class StopRequest:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self.signal is not None:
+            if self._patient:
+                return
             raise KeyboardInterrupt
         self.signal = number
-        how = "Ctrl-C" if number == signal.SIGINT else "SIGTERM"
-        sys.stderr.write(
-            f"\n{how}: saving and stopping at the next safe point (again: stop at once)\n"
-        )
+        how = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        again = "" if self._patient else " (again: stop at once)"
+        sys.stderr.write(f"\n{how}: saving and stopping at the next safe point{again}\n")
         sys.stderr.flush()

@@ -14,11 +14,10 @@ from pgdm.cli.train import notify
 from pgdm.config.strict import build
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.sweep.estimate import Estimate, estimate
-from pgdm.sweep.local import run_sweep
-from pgdm.sweep.plan import LocalCfg, Plan, SweepCfg, check_fits
+from pgdm.sweep.launch import run_sweep
+from pgdm.sweep.plan import LAUNCHERS, LauncherCfg, LocalCfg, Plan, SweepCfg, check_fits
 from pgdm.sweep.planning import make_plan
 
-_LAUNCHERS = ("local",)
 _WIDE = 200  # columns where nobody's terminal sets them
 _MOST_NOTES = 3
 
@@ -47,15 +46,27 @@ def run_planned(composed: Composed, name: str, command: str) -> int:
     return run_sweep(plan, sweep, launcher, notify)
 
 
-def _launcher(composed: Composed) -> LocalCfg:
-    if composed.launcher_choice not in _LAUNCHERS:
-        raise UnknownNameError("hydra/launcher of pgdm", composed.launcher_choice, _LAUNCHERS)
-    launcher = build(LocalCfg, composed.launcher, "hydra.launcher")
-    for key in ("max_jobs", "cores_per_job"):
-        if (value := getattr(launcher, key)) < 0:
-            raise ConfigError(f"hydra.launcher.{key} is {value}; it must be at least 0")
+def _launcher(composed: Composed) -> LauncherCfg:
+    choice = composed.launcher_choice
+    if choice not in LAUNCHERS:
+        raise UnknownNameError("hydra/launcher of pgdm", choice, LAUNCHERS)
+    launcher: LauncherCfg = build(LAUNCHERS[choice], composed.launcher, "hydra.launcher")
+    least = (
+        {"max_jobs": 0, "cores_per_job": 0}
+        if isinstance(launcher, LocalCfg)
+        else {"time_min": 1, "cores_per_job": 1, "signal_delay_s": 1, "poll_s": 1}
+        | {"gpus_per_job": 0, "array_parallelism": 0}
+    )
+    for key, bound in least.items():
+        if (value := getattr(launcher, key)) < bound:
+            raise ConfigError(f"hydra.launcher.{key} is {value}; it must be at least {bound}")
     if (memory := launcher.memory_per_job_gb) <= 0:
         raise ConfigError(f"hydra.launcher.memory_per_job_gb is {memory}; it must be above 0")
+    if not isinstance(launcher, LocalCfg) and launcher.signal_delay_s >= 60 * launcher.time_min:
+        raise ConfigError(
+            f"hydra.launcher.signal_delay_s is {launcher.signal_delay_s}, and the time limit "
+            f"time_min only {launcher.time_min} minutes; choose a longer one"
+        )
     return launcher
 
 

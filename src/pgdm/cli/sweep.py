@@ -30,6 +30,8 @@ from pgdm.sweep.ledger import (
     Ledger,
 )
 from pgdm.sweep.mirror import SweepMirror
+from pgdm.sweep.queue import Queue
+from pgdm.sweep.queue import cancel as cancel_in_slurm
 from pgdm.sweep.state import NAME, SLOTS, Row, log_path, parent, rows, settle, summarize
 from pgdm.sweep.view import SweepView, failures, percent, span, summary_line
 
@@ -44,6 +46,7 @@ _PLAN = "plan.json"  # pgdm.sweep.plan knows it too, and loads torch
 _WIDE = 200  # columns where nobody's terminal sets them
 _POLL_S = 0.5
 _STOP_S = 120.0
+_ASK_S = 2.0
 
 app = typer.Typer(help="Look after a sweep: see it, end it, go on with it.", no_args_is_help=True)
 
@@ -61,8 +64,9 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
     """Show each job: state, frames, success, attempts, time left; and all of it in one line."""
-    ledger = settled(folder)
-    found = rows(ledger)
+    queue = Queue()
+    ledger = settled(folder, queue)
+    found = rows(ledger, queue)
     summary = summarize(found, ledger.fact(SLOTS) or 1)
     if as_json:
         whole = {"name": ledger.fact(NAME), "driven": parent(ledger) is not None}
@@ -72,25 +76,27 @@ def status(
     console = Console() if sys.stdout.isatty() else Console(width=_WIDE)
     console.print(_table(found))
     print(summary_line(ledger.fact(NAME) or folder.name, summary))
-    if parent(ledger) is None and any(row.state in (WAITING, INTERRUPTED) for row in found):
+    left = [row for row in found if row.state in (WAITING, INTERRUPTED) and row.slurm is None]
+    if parent(ledger) is None and left:
         print(f"nobody works on it; pgdm sweep resume {folder} goes on")
 
 
 @app.command()
 def watch(folder: Folder) -> None:
     """Follow a sweep until it ends; Ctrl-C only ends the watching."""
-    ledger = settled(folder)
+    queue = Queue()
+    ledger = settled(folder, queue)
     try:
-        with SweepView(ledger.fact(NAME) or folder.name, ledger) as view:
-            while parent(ledger) is not None:
+        with SweepView(ledger.fact(NAME) or folder.name, ledger, queue) as view:
+            while parent(ledger) is not None or any(row.slurm for row in rows(ledger, queue)):
                 view.update()
                 time.sleep(_POLL_S)
     except KeyboardInterrupt:
         print(f"the sweep goes on; pgdm sweep cancel {folder} ends it", file=sys.stderr)
         raise typer.Exit(INTERRUPTED_CODE) from None
-    settled(folder)
+    settled(folder, queue)
     print(view.line())
-    if text := failures(rows(ledger)):
+    if text := failures(rows(ledger, queue)):
         print(text)
     raise typer.Exit(int(any(state != FINISHED for state in ledger.states().values())))
 
@@ -102,16 +108,17 @@ def logs(
     follow: Annotated[bool, typer.Option("-f", "--follow", help="Go on until it ends.")] = False,
 ) -> None:
     """Print what a job's last attempt printed."""
-    ledger = settled(folder)
+    queue = Queue()
+    ledger = settled(folder, queue)
     entry = _one(ledger.entries(), job)
-    if entry.last is None:
+    path = log_path(ledger.folder, entry.name, 0 if entry.last is None else entry.last.number)
+    if not path.exists():
         raise SweepError(f"{entry.name} has not been started yet")
-    path = log_path(ledger.folder, entry.name, entry.last.number)
     with open(path, errors="replace") as log:
         while True:
             # Asked before reading: what it wrote last is then there.
             goes_on = follow and any(
-                r.key == entry.key and r.state == RUNNING for r in rows(ledger)
+                r.key == entry.key and r.state == RUNNING for r in rows(ledger, queue)
             )
             while text := log.read(1 << 16):
                 print(text, end="", flush=True)
@@ -123,17 +130,19 @@ def logs(
 @app.command()
 def cancel(folder: Folder, jobs: Jobs = None) -> None:
     """Stop jobs, or all that are not finished: running ones save what they have reached."""
-    ledger = settled(folder)
+    queue = Queue(_ASK_S)
+    ledger = settled(folder, queue)
     ended = (FINISHED, FAILED) if not jobs else (FINISHED,)
     chosen = [entry for entry in _chosen(ledger, jobs) if entry.state not in ended]
     keys = {entry.key for entry in chosen}
     ledger.set_states(dict.fromkeys(keys, CANCELLED))
     if parent(ledger) is None:
-        for entry in chosen:
-            if entry.last is not None and entry.last.state == RUNNING:
-                entry.last.process.signal(signal.SIGTERM)
+        at_work = [e.last for e in chosen if e.last is not None and e.last.state == RUNNING]
+        cancel_in_slurm(attempt.slurm_id for attempt in at_work if attempt.slurm_id is not None)
+        for attempt in at_work:
+            attempt.process.signal(signal.SIGTERM)
     limit = time.monotonic() + _STOP_S
-    while any(row.state == RUNNING and row.key in keys for row in rows(ledger)):
+    while any(row.state == RUNNING and row.key in keys for row in rows(ledger, queue)):
         if time.monotonic() > limit:
             raise SweepError(f"not all have stopped yet; see pgdm sweep status {folder}")
         time.sleep(_POLL_S)
@@ -166,7 +175,7 @@ def resume(folder: Folder, detach: Detach = False) -> None:
 
 def _go_on(folder: Path, detach: bool = False, keys: set[str] | None = None) -> int:
     from pgdm.cli.train import notify
-    from pgdm.sweep.local import launched, run_sweep
+    from pgdm.sweep.launch import launched, run_sweep
     from pgdm.sweep.plan import read_plan
 
     plan = read_plan(folder)
@@ -177,7 +186,7 @@ def _go_on(folder: Path, detach: bool = False, keys: set[str] | None = None) -> 
     return run_sweep(plan, dataclasses.replace(sweep, detach=detach), launcher, notify)
 
 
-def settled(folder: Path) -> Ledger:
+def settled(folder: Path, queue: Queue | None = None) -> Ledger:
     """Return a sweep's ledger, brought to the truth, and MLflow with it."""
     if not (folder / _PLAN).exists():
         raise SweepError(f"'{folder}' holds no sweep: it has no {_PLAN}")
@@ -190,7 +199,7 @@ def settled(folder: Path) -> Ledger:
         recall(ledger, read_plan(folder))
     if parent(ledger) is not None:
         return ledger  # it sees to all that itself
-    closed = settle(ledger)
+    closed = settle(ledger, queue)
     mirror = SweepMirror.left_running(ledger.folder, lambda text: print(text, file=sys.stderr))
     if mirror is not None:
         for entry in closed:
@@ -228,7 +237,7 @@ def _table(found: Sequence[Row]) -> Table:
     table.add_column("state")
     for head in ("frames", "success", "attempts", "left"):
         table.add_column(head, justify="right")
-    table.add_column("error", overflow="fold")
+    table.add_column("error, or what Slurm says", overflow="fold")
     for row in found:
         table.add_row(
             escape(row.name),
@@ -237,6 +246,6 @@ def _table(found: Sequence[Row]) -> Table:
             percent(row.success),
             str(row.attempts),
             "-" if row.left_s is None else span(row.left_s),
-            escape(row.error or ""),
+            escape(row.error or row.slurm or ""),
         )
     return table

@@ -21,16 +21,20 @@ def notify(text: str) -> None:
     _PROGRESS.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def train(cfg: ExperimentCfg) -> int:
+def train(cfg: ExperimentCfg, patient: bool = False) -> int:
     """Do a run, or go on with it, and return the exit code.
 
     Progress goes to stderr, the result to stdout.
+
+    Args:
+        cfg: the run.
+        patient: whether a second signal leaves it to save in peace.
 
     Raises:
         PgdmError: if the run fails.
     """
     view = ProgressView(cfg.task.id, _PROGRESS)
-    with StopRequest() as stop:
+    with StopRequest(patient) as stop:
         try:
             result = run_experiment(cfg, (view,), stop, notify)
         except KeyboardInterrupt as error:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import signal
-import subprocess
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 from pgdm.config.saved import load_config
-from pgdm.errors import ConfigError, RunError
-from pgdm.stop import StopRequest
+from pgdm.errors import ConfigError, RunError, SweepError
+from pgdm.stop import STOPPED, StopRequest
+from pgdm.sweep.launcher import Ended, Launcher, Task
 from pgdm.sweep.ledger import (
     CANCELLED,
     FAILED,
@@ -23,6 +21,7 @@ from pgdm.sweep.ledger import (
     INTERRUPTED,
     RUNNING,
     WAITING,
+    Attempt,
     Ending,
     Entry,
     Ledger,
@@ -34,46 +33,23 @@ from pgdm.sweep.state import NAME, PARENT, SLOTS, log_path, rows, settle, stand,
 from pgdm.sweep.view import SweepView, failures
 from pgdm.tracking.run_folder import RunFolder
 
-_TICK_S = 0.2
 _STOP_S = 60.0
 """How long workers may take to save when the sweep itself fails."""
-_STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
+_AGAIN_S = 60.0
+"""How long to wait after a launcher has refused, while others are at work."""
 
 Notify = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class Room:
-    """How jobs share this machine."""
-
-    slots: int
-    """Jobs at a time."""
-    threads: int
-    """Of each job that does not say so itself."""
-
-
 @dataclass
 class _Worker:
-    """A process at work on a job."""
+    """A process at work on a job, or about to be."""
 
-    job: Job
-    number: int
-    """Of the attempt."""
-    process: subprocess.Popen[bytes]
+    task: Task
+    frames: int
+    """How far the job was before."""
     asked: bool = False
     """Whether it was asked to stop."""
-
-    def ask(self) -> None:
-        """Ask it to save and stop, once: a second signal would end it without saving."""
-        if not self.asked:
-            self.process.send_signal(signal.SIGTERM)
-        self.asked = True
-
-    def kill(self) -> None:
-        """End it at once, with all that it started."""
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait()
 
 
 class Driver:
@@ -82,20 +58,22 @@ class Driver:
     Args:
         plan: the jobs.
         max_attempts: how often a job is tried.
-        room: how many run at a time.
+        launcher: starts workers.
         notify: told in a sentence what people should know.
     """
 
-    def __init__(self, plan: Plan, max_attempts: int, room: Room, notify: Notify) -> None:
-        self._plan, self._max_attempts, self._room, self._notify = plan, max_attempts, room, notify
+    def __init__(self, plan: Plan, max_attempts: int, launcher: Launcher, notify: Notify) -> None:
+        self._plan, self._max_attempts, self._notify = plan, max_attempts, notify
+        self._launcher = launcher
         self._jobs = {job.key: job for job in plan.jobs}
         self._ledger = Ledger(plan.folder)
         self._mirror = SweepMirror.of(plan, notify)
-        self._view = SweepView(plan.name, self._ledger)
+        self._view = SweepView(plan.name, self._ledger, launcher.queue)
         self._tries: Counter[str] = Counter()
         self._workers: list[_Worker] = []
         self._left_over: list[Entry] = []
         self._told_busy: set[str] = set()
+        self._not_before_s = 0.0
 
     def run(self, stop: StopRequest) -> int:
         """Work until nothing is left, or until ``stop``; return the exit code."""
@@ -106,17 +84,22 @@ class Driver:
         except KeyboardInterrupt:
             for worker in self._workers:
                 worker.asked = True
-                worker.kill()
+            self._launcher.end([worker.task for worker in self._workers], 0.0)
             self._reap()
         finally:
-            self._end()
+            self._launcher.end([worker.task for worker in self._workers], _STOP_S)
         states = self._ledger.states()
         whole = all(states[key] == FINISHED for key in self._jobs)
         stopped = stop() and not whole
         self._mirror.close(FINISHED if whole else INTERRUPTED if stopped else FAILED)
         self._notify(self._view.line())
-        if text := failures(rows(self._ledger)):
+        if text := failures(rows(self._ledger, self._launcher.queue)):
             self._notify(text)
+        if self._workers:
+            self._notify(
+                "the jobs go on without this process: the same command looks after them again, "
+                f"pgdm sweep cancel {self._plan.folder} ends them"
+            )
         return stop.exit_code if stopped else int(not whole)
 
     def _prepare(self) -> None:
@@ -124,19 +107,28 @@ class Driver:
         ledger, me = self._ledger, Process.of(os.getpid())
         recall(ledger, self._plan)
         ledger.set_fact(NAME, self._plan.name)
-        ledger.set_fact(SLOTS, self._room.slots)
+        ledger.set_fact(SLOTS, self._launcher.slots)
         ledger.set_fact(PARENT, [me.host, me.pid, me.born])
         self._mirror.open(self._plan)
-        for entry in settle(ledger):
+        for entry in settle(ledger, self._launcher.queue):
             self._mirror.correct(entry.run_dir)
         states: dict[str, str] = {}
         for entry in ledger.entries():
             if entry.last is not None and entry.last.state == RUNNING:
-                self._left_over.append(entry)
+                self._adopt(entry, entry.last)
                 states[entry.key] = RUNNING
             elif entry.key in self._jobs:
                 states[entry.key] = self._first_state(entry)
         ledger.set_states(states)
+
+    def _adopt(self, entry: Entry, attempt: Attempt) -> None:
+        """Look after a worker that another driver has left, or at least wait for its end."""
+        job = self._jobs.get(entry.key)
+        if job is not None and self._launcher.adopt(task := Task(job, attempt.number), attempt):
+            self._tries[job.key] += 1
+            self._workers.append(_Worker(task, _frames(job)))
+        else:
+            self._left_over.append(entry)
 
     def _first_state(self, entry: Entry) -> str:
         """Return whether a job is finished or waits; the folder decides, not the ledger."""
@@ -147,23 +139,28 @@ class Driver:
     def _loop(self, stop: StopRequest) -> None:
         while True:
             self._reap()
+            if stop() and self._launcher.stays:
+                return
             if stop():
                 self._left_over.clear()  # they have been stopping since their own driver went
             self._take_over()
             states = self._ledger.states()
-            for worker in self._workers:
-                if stop() or states[worker.job.key] == CANCELLED:
-                    worker.ask()
+            self._ask([w for w in self._workers if stop() or states[w.task.job.key] == CANCELLED])
             waiting = [j for j in self._plan.jobs if states[j.key] == WAITING and not stop()]
-            for job in waiting:
-                if len(self._workers) + len(self._left_over) >= self._room.slots:
-                    break
-                if self._is_free(job):
-                    self._start(job)
+            more = self._launcher.more(len(self._workers) + len(self._left_over))
+            if time.monotonic() >= self._not_before_s:
+                self._start(list(islice(filter(self._is_free, waiting), max(more, 0))))
             if not self._workers and not self._left_over and not waiting:
                 return
             self._view.update()
-            time.sleep(_TICK_S)
+            time.sleep(self._launcher.tick_s)
+
+    def _ask(self, workers: Sequence[_Worker]) -> None:
+        """Ask workers to save and stop, each of them once."""
+        if tasks := [worker.task for worker in workers if not worker.asked]:
+            self._launcher.ask(tasks)
+        for worker in workers:
+            worker.asked = True
 
     def _is_free(self, job: Job) -> bool:
         """Return whether nobody else works in a job's folder; tell about it once."""
@@ -173,55 +170,73 @@ class Driver:
             self._notify(f"{job.name}: another process is using {job.cfg.run_dir}; waiting for it")
         return not busy
 
-    def _start(self, job: Job) -> None:
-        """Start a process for a job."""
-        self._mirror.adopt(job)
-        if self._tries[job.key] >= self._max_attempts:
-            self._tries[job.key] = 0  # somebody asked for it anew
-        self._tries[job.key] += 1
-        number = self._ledger.begin(job.key, Process.of(os.getpid()))
-        place = [str(self._plan.folder), job.key, str(number), str(self._room.threads)]
-        with open(log_path(self._plan.folder, job.name, number), "wb") as output:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "pgdm.cli.worker", *place],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C is for us: we ask the workers
-            )
-        self._workers.append(_Worker(job, number, process))
+    def _start(self, jobs: Sequence[Job]) -> None:
+        """Start workers for jobs."""
+        if not jobs:
+            return
+        me = Process.of(os.getpid())
+        for job in jobs:
+            self._mirror.adopt(job)
+        tasks = [Task(job, self._ledger.begin(job.key, me)) for job in jobs]
+        try:
+            self._launcher.start(tasks)
+        except SweepError as error:
+            self._refused(tasks, error)
+            return
+        for task in tasks:
+            if self._tries[task.job.key] >= self._max_attempts:
+                self._tries[task.job.key] = 0  # somebody asked for it anew
+            self._tries[task.job.key] += 1
+            self._workers.append(_Worker(task, _frames(task.job)))
+
+    def _refused(self, tasks: Sequence[Task], error: SweepError) -> None:
+        """Note that workers could not be started; what is at work meanwhile is a reason to wait."""
+        for task in tasks:
+            found = stand(Path(task.job.cfg.run_dir), task.job.cfg.total_frames)
+            self._ledger.end(*task.id, replace(found, state=FAILED, error=str(error)))
+        self._ledger.set_states({task.job.key: WAITING for task in tasks})
+        if not self._workers:
+            raise error
+        self._notify(f"{error}; trying again in {_AGAIN_S:.0f} s")
+        self._not_before_s = time.monotonic() + _AGAIN_S
 
     def _reap(self) -> None:
         """See which workers have ended, and how."""
-        for worker in [w for w in self._workers if w.process.poll() is not None]:
+        found = [(worker, self._launcher.ended(worker.task)) for worker in self._workers]
+        for worker, ended in found:
+            if ended is None:
+                continue
             self._workers.remove(worker)
-            job, key = worker.job, worker.job.key
-            ending = self._ending(worker)
-            self._ledger.end(key, worker.number, ending)
-            if worker.process.returncode != 0:
+            job, key = worker.task.job, worker.task.job.key
+            ending = self._ending(worker, ended)
+            self._ledger.end(*worker.task.id, ending)
+            if ended.code != 0:
                 self._mirror.correct(Path(job.cfg.run_dir))
+            if ended.displaced and (ending.frames or 0) > worker.frames:
+                self._tries[key] -= 1
             if ending.state == FINISHED or self._ledger.states()[key] == CANCELLED:
                 state = FINISHED if ending.state == FINISHED else CANCELLED
             elif worker.asked:
                 state = INTERRUPTED
             else:
                 state = WAITING if self._tries[key] < self._max_attempts else FAILED
-                self._notify(f"{job.name}: attempt {worker.number} {ending.state}: {ending.error}")
+                number = worker.task.number
+                self._notify(f"{job.name}: attempt {number} {ending.state}: {ending.error}")
             self._ledger.set_states({key: state})
 
-    def _ending(self, worker: _Worker) -> Ending:
+    def _ending(self, worker: _Worker, ended: Ended) -> Ending:
         """Return how an attempt ended, by what run folder, exit code and log tell."""
-        code, cfg = worker.process.returncode, worker.job.cfg
-        found = stand(Path(cfg.run_dir), cfg.total_frames)
-        if found.state == FINISHED and _holds(worker.job):
+        code, job = ended.code, worker.task.job
+        found = stand(Path(job.cfg.run_dir), job.cfg.total_frames)
+        if found.state == FINISHED and _holds(job):
             state, error = FINISHED, None
-        elif code < 0:
-            state = INTERRUPTED if worker.asked else FAILED
-            error = f"killed by {signal.Signals(-code).name}"
-        elif code in _STOPPED or code == 0:
+        elif ended.error is not None:
+            state = INTERRUPTED if worker.asked or ended.displaced else FAILED
+            error = ended.error
+        elif code in STOPPED or code == 0:
             state, error = INTERRUPTED, "stopped from outside"
         else:
-            log = log_path(self._plan.folder, worker.job.name, worker.number)
+            log = log_path(self._plan.folder, job.name, worker.task.number)
             state, error = FAILED, _last_error(log)
         return Ending(state, code, found.frames, found.metrics, error)
 
@@ -229,7 +244,7 @@ class Driver:
         """Take over the jobs whose workers a killed driver left, once these have ended."""
         for entry in list(self._left_over):
             assert entry.last is not None
-            if works(entry.last, entry.run_dir):
+            if works(entry.last, entry.run_dir, self._launcher.queue):
                 continue
             self._left_over.remove(entry)
             ending = stand(entry.run_dir, entry.total_frames)
@@ -239,17 +254,6 @@ class Driver:
                 self._ledger.set_states({entry.key: ending.state})
             elif self._ledger.states()[entry.key] != CANCELLED:
                 self._ledger.set_states({entry.key: WAITING})
-
-    def _end(self) -> None:
-        """Leave no worker behind, whatever went wrong."""
-        for worker in self._workers:
-            worker.ask()
-        limit = time.monotonic() + _STOP_S
-        for worker in self._workers:
-            try:
-                worker.process.wait(max(limit - time.monotonic(), 0))
-            except subprocess.TimeoutExpired:
-                worker.kill()
 
 
 def recall(ledger: Ledger, plan: Plan) -> None:
@@ -265,6 +269,11 @@ def recall(ledger: Ledger, plan: Plan) -> None:
         ledger.set_states({entry.key: ending.state})
 
 
+def _frames(job: Job) -> int:
+    """Return how far a job is, environment steps."""
+    return stand(Path(job.cfg.run_dir), job.cfg.total_frames).frames or 0
+
+
 def _holds(job: Job) -> bool:
     """Return whether a job's folder holds its run, and no other one."""
     try:
@@ -275,6 +284,7 @@ def _holds(job: Job) -> bool:
 
 def _last_error(log: Path) -> str:
     """Return the last error that a log tells, or its last line."""
-    lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    text = log.read_text(errors="replace") if log.exists() else ""
+    lines = [line for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("error: ")]
     return (errors or lines or ["it printed nothing"])[-1].removeprefix("error: ")

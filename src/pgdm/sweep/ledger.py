@@ -36,7 +36,8 @@ CREATE TABLE IF NOT EXISTS jobs (
     key TEXT PRIMARY KEY, place INTEGER, name TEXT, run_dir TEXT, total_frames INTEGER, state TEXT);
 CREATE TABLE IF NOT EXISTS attempts (
     key TEXT, number INTEGER, state TEXT, host TEXT, pid INTEGER, born TEXT, start REAL, end REAL,
-    exit_code INTEGER, frames INTEGER, metrics TEXT, error TEXT, PRIMARY KEY (key, number));
+    exit_code INTEGER, frames INTEGER, metrics TEXT, error TEXT, slurm_id TEXT,
+    PRIMARY KEY (key, number));
 CREATE TABLE IF NOT EXISTS facts (name TEXT PRIMARY KEY, value TEXT);
 COMMIT;
 """
@@ -63,6 +64,8 @@ class Attempt:
     metrics: Mapping[str, float] | None = None
     """Its last evaluation."""
     error: str | None = None
+    slurm_id: str | None = None
+    """Slurm's name of the job that makes it, if one does."""
 
 
 @dataclass(frozen=True)
@@ -160,12 +163,23 @@ class Ledger:
 
         return self._do(work)
 
-    def register(self, key: str, number: int, process: Process) -> bool:
+    def submitted(self, slurm_ids: Mapping[tuple[str, int], str]) -> None:
+        """Note which of Slurm's jobs make which attempts: a key and a number each."""
+        # The process was their driver's; what runs already has noted more.
+        self._write(
+            "UPDATE attempts SET slurm_id = ?, host = '', pid = 0, born = '' "
+            "WHERE key = ? AND number = ? AND slurm_id IS NULL",
+            [(slurm_id, *place) for place, slurm_id in slurm_ids.items()],
+        )
+
+    def register(
+        self, key: str, number: int, process: Process, slurm_id: str | None = None
+    ) -> bool:
         """Note which process works on an attempt; false if it has been given up meanwhile."""
         changed = self._write(
-            "UPDATE attempts SET host = ?, pid = ?, born = ? "
+            "UPDATE attempts SET host = ?, pid = ?, born = ?, slurm_id = ? "
             "WHERE key = ? AND number = ? AND state = 'running'",
-            [(process.host, process.pid, process.born, key, number)],
+            [(process.host, process.pid, process.born, slurm_id, key, number)],
         )
         return changed == 1
 
@@ -271,7 +285,7 @@ def _explained(path: Path, error: sqlite3.Error) -> str:
 
 
 def _attempt(row: tuple[Any, ...]) -> Attempt:
-    key, number, state, host, pid, born, start, end, code, frames, metrics, error = row
+    key, number, state, host, pid, born, start, end, code, frames, metrics, error, slurm_id = row
     known = json.loads(metrics) if metrics else None
     process = Process(host, pid, born)
-    return Attempt(key, number, state, process, start, end, code, frames, known, error)
+    return Attempt(key, number, state, process, start, end, code, frames, known, error, slurm_id)

@@ -1,35 +1,32 @@
-"""A sweep on this machine: a process for each job, as many at a time as there is room for."""
+"""Workers on this machine: a process for each job, as many at a time as there is room for."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from pgdm.sweep.launcher import Ended, Task
+from pgdm.sweep.ledger import Attempt
+from pgdm.sweep.plan import LocalCfg, Plan
+from pgdm.sweep.queue import Queue
+from pgdm.sweep.state import log_path
 
-from pgdm.config.strict import build
-from pgdm.errors import ConfigError, SweepError
-from pgdm.stop import StopRequest
-from pgdm.sweep.driver import Driver, Room
-from pgdm.sweep.ledger import Ledger
-from pgdm.sweep.plan import LocalCfg, Plan, SweepCfg, record
-from pgdm.sweep.state import LOGS, parent
-from pgdm.tracking.run_folder import read_json, write_json
 
-LAUNCH = "launch.json"
-"""How the sweep was started last, beside its plan."""
-OUTPUT = "sweep.log"
-"""What a sweep in the background prints, among the logs."""
-LOCK = ".lock"
-_POLL_S = 0.1
+@dataclass(frozen=True)
+class Room:
+    """How jobs share this machine."""
 
-Notify = Callable[[str], None]
+    slots: int
+    """Jobs at a time."""
+    threads: int
+    """Of each job that does not say so itself."""
 
 
 def room(plan: Plan, launcher: LocalCfg, cores: int, memory_gb: float) -> Room:
@@ -58,93 +55,68 @@ def free_memory_gb() -> float:
     return int(fields["MemAvailable"].split()[0]) / 1e6
 
 
-def run_sweep(plan: Plan, sweep: SweepCfg, launcher: LocalCfg, notify: Notify) -> int:
-    """Do what is left of a sweep, and return the exit code.
-
-    0: every job is finished; 1: not every one; 130 or 143: stopped by a signal.
+class LocalLauncher:
+    """Starts workers on this machine; as ``Launcher`` says.
 
     Args:
-        plan: the jobs; its folder may hold them in any state.
-        sweep: how often a job is tried, and whether to stay in the background.
-        launcher: how many at a time.
-        notify: told in a sentence what people should know.
-
-    Raises:
-        SweepError: if another process is at it, the folder holds a sweep with other settings, or
-            cannot be used.
+        plan: the jobs.
+        cfg: limits.
     """
-    plan.folder.joinpath(LOGS).mkdir(parents=True, exist_ok=True)
-    with held(plan):
-        record(plan)
-        write_json(plan.folder / LAUNCH, {"sweep": asdict(sweep), "launcher": asdict(launcher)})
-        if not sweep.detach:
-            shared = room(plan, launcher, len(os.sched_getaffinity(0)), free_memory_gb())
-            with StopRequest() as stop:
-                return Driver(plan, sweep.max_attempts, shared, notify).run(stop)
-    return _detach(plan, notify)
 
+    tick_s, stays = 0.2, False
 
-def launched(plan: Plan) -> tuple[SweepCfg, LocalCfg]:
-    """Return how a sweep was started last.
+    def __init__(self, plan: Plan, cfg: LocalCfg) -> None:
+        shared = room(plan, cfg, len(os.sched_getaffinity(0)), free_memory_gb())
+        self.slots, self._threads = shared.slots, shared.threads
+        self._folder, self.queue = plan.folder, Queue()
+        self._processes: dict[tuple[str, int], subprocess.Popen[bytes]] = {}
+        self._asked: set[tuple[str, int]] = set()
 
-    Raises:
-        SweepError: if that is not known.
-    """
-    known = read_json(plan.folder / LAUNCH)
-    try:
-        return build(SweepCfg, known["sweep"]), build(LocalCfg, known["launcher"])
-    except (KeyError, ConfigError) as error:
-        raise SweepError(
-            f"{plan.folder / LAUNCH} does not say how the sweep was started; start it by its own "
-            f"command: {plan.command}"
-        ) from error
+    def more(self, working: int) -> int:
+        """Return how many free places there are."""
+        return self.slots - working
 
+    def start(self, tasks: Sequence[Task]) -> None:
+        """Start a process for each."""
+        for task in tasks:
+            place = [str(self._folder), task.job.key, str(task.number), str(self._threads)]
+            with open(log_path(self._folder, task.job.name, task.number), "wb") as output:
+                self._processes[task.id] = subprocess.Popen(
+                    [sys.executable, "-m", "pgdm.cli.worker", *place],
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,  # Ctrl-C is for us: we ask the workers
+                )
 
-@contextlib.contextmanager
-def held(plan: Plan) -> Iterator[None]:
-    """Keep other processes from driving the sweep.
+    def adopt(self, task: Task, attempt: Attempt) -> bool:
+        """Refuse: only who has started a process learns how it ends."""
+        del task, attempt
+        return False
 
-    Raises:
-        SweepError: if another process does already.
-    """
-    lock = FileLock(plan.folder / LOCK)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        other = parent(Ledger(plan.folder))
-        who = f"process {other.pid}" if other else "another process"
-        raise SweepError(
-            f"sweep '{plan.name}' is run by {who} already; see it with pgdm sweep watch "
-            f"{plan.folder}, end it with pgdm sweep cancel {plan.folder}"
-        ) from error
-    try:
-        yield
-    finally:
-        lock.release()
+    def ended(self, task: Task) -> Ended | None:
+        """Return how a process ended."""
+        code = self._processes[task.id].poll()
+        if code is None:
+            return None
+        return Ended(code, f"killed by {signal.Signals(-code).name}" if code < 0 else None)
 
+    def ask(self, tasks: Sequence[Task]) -> None:
+        """Ask processes once: a second signal would end them without saving."""
+        for task in tasks:
+            if task.id not in self._asked:
+                self._processes[task.id].send_signal(signal.SIGTERM)
+        self._asked |= {task.id for task in tasks}
 
-def _detach(plan: Plan, notify: Notify) -> int:
-    """Start the sweep again in a session of its own, and see it off."""
-    output = plan.folder / LOGS / OUTPUT
-    code = "import sys; from pgdm.cli.main import main; sys.exit(main())"
-    with open(output, "ab") as log:
-        child = subprocess.Popen(
-            [sys.executable, "-c", code, "sweep", "resume", str(plan.folder)],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-        )
-    ledger = Ledger(plan.folder)
-    while (driver := parent(ledger)) is None or driver.pid != child.pid:
-        if (ended := child.poll()) is not None:
-            if ended:
-                raise SweepError(f"the sweep ended at once; {output} tells why")
-            break
-        time.sleep(_POLL_S)
-    notify(
-        f"sweep '{plan.name}' goes on in the background (process {child.pid})\n"
-        f"  watch it: pgdm sweep watch {plan.folder}\n"
-        f"  end it:   pgdm sweep cancel {plan.folder}"
-    )
-    return 0
+    def end(self, tasks: Sequence[Task], patience_s: float) -> None:
+        """End processes, and what does not end in time with all that it started."""
+        if patience_s:
+            self.ask(tasks)
+        limit = time.monotonic() + patience_s
+        for process in (self._processes[task.id] for task in tasks):
+            try:
+                process.wait(max(limit - time.monotonic(), 0))
+            except subprocess.TimeoutExpired:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()

@@ -52,6 +52,46 @@ class LocalCfg:
 
 
 @dataclass(frozen=True)
+class SlurmCfg:
+    """What each job gets on a Slurm cluster."""
+
+    name: str
+    """Which launcher this is: ``slurm``."""
+    partition: str | None
+    """None is the cluster's default."""
+    account: str | None
+    """Account to charge; None is the user's default."""
+    qos: str | None
+    """Quality of service; None is the default."""
+    constraint: str | None
+    """Features that nodes must have; None takes any node."""
+    time_min: int
+    """Time limit; at the limit a job saves, and goes on under the next one [min]."""
+    cores_per_job: int
+    """Cores, and threads, of each job."""
+    memory_per_job_gb: float
+    """Memory of each job [GB]."""
+    gpus_per_job: int
+    """GPUs of each job."""
+    gres: str | None
+    """Other generic resources of each job, such as ``shard:1``."""
+    array_parallelism: int
+    """Most jobs at a time; 0 is as many as Slurm lets run."""
+    signal_delay_s: int
+    """How long before the time limit a job is told to save [s]."""
+    poll_s: float
+    """Time between two questions to Slurm, one for all jobs [s]."""
+    setup: list[str]
+    """Shell commands before each job."""
+    additional_parameters: list[str]
+    """Further options of sbatch, each ``NAME`` or ``NAME=VALUE``."""
+
+
+LauncherCfg = LocalCfg | SlurmCfg
+LAUNCHERS = {"local": LocalCfg, "slurm": SlurmCfg}
+
+
+@dataclass(frozen=True)
 class Job:
     """One experiment of a sweep."""
 

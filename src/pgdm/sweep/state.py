@@ -7,7 +7,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from pgdm.sweep.ledger import (
     Ledger,
 )
 from pgdm.sweep.processes import Process
+from pgdm.sweep.queue import UNKNOWN, Queue
 from pgdm.tracking.run_folder import RunFolder
 from pgdm.tracking.run_log import Record, metrics_of
 
@@ -43,7 +44,7 @@ class Row:
     key: str
     name: str
     state: str
-    """True now: ``running`` only if its process lives."""
+    """True now: ``running`` only if its process lives, or Slurm runs it."""
     attempts: int
     frames: int
     total_frames: int
@@ -59,6 +60,8 @@ class Row:
     log: Path | None
     """Output of the last attempt."""
     error: str | None
+    slurm: str | None
+    """What Slurm says of it, such as ``12_3 PENDING (Resources)``, while an attempt is there."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +91,15 @@ def stand(run_dir: Path, total_frames: int) -> Ending:
     return Ending(state, None, frames, metrics, result.get("error"))
 
 
-def works(attempt: Attempt, run_dir: Path) -> bool:
-    """Return whether an attempt's process is at work, as far as that can be told from here."""
+def works(attempt: Attempt, run_dir: Path, queue: Queue) -> bool:
+    """Return whether an attempt is at work, as far as that can be told from here.
+
+    What is in Slurm's hands counts: it will be at work, or again.
+    """
     if attempt.state != RUNNING:
         return False
+    if attempt.slurm_id is not None:
+        return queue.find(attempt.slurm_id).alive
     return attempt.process.alive or (
         not attempt.process.here and RunFolder(run_dir).status() == RUNNING
     )
@@ -104,12 +112,17 @@ def parent(ledger: Ledger) -> Process | None:
     return process if process is not None and process.alive else None
 
 
-def settle(ledger: Ledger) -> list[Entry]:
-    """Close the attempts whose process is gone, and return their jobs as they were before."""
-    closed = []
+def settle(ledger: Ledger, queue: Queue | None = None) -> list[Entry]:
+    """Close the attempts whose process is gone, and return their jobs as they were before.
+
+    Args:
+        ledger: of the sweep.
+        queue: where its jobs stand in Slurm; None asks anew.
+    """
+    queue, closed = queue or Queue(), []
     for entry in ledger.entries():
         last = entry.last
-        if last is None or last.state != RUNNING or works(last, entry.run_dir):
+        if last is None or last.state != RUNNING or works(last, entry.run_dir, queue):
             continue
         ending = stand(entry.run_dir, entry.total_frames)
         ledger.end(entry.key, last.number, ending)
@@ -119,9 +132,10 @@ def settle(ledger: Ledger) -> list[Entry]:
     return closed
 
 
-def rows(ledger: Ledger) -> list[Row]:
-    """Return all jobs of a sweep in the order of its plan."""
-    return [_row(ledger.folder, entry) for entry in ledger.entries()]
+def rows(ledger: Ledger, queue: Queue | None = None) -> list[Row]:
+    """Return all jobs of a sweep in the order of its plan; ``queue`` as for ``settle``."""
+    queue = queue or Queue()
+    return [_row(ledger.folder, entry, queue) for entry in ledger.entries()]
 
 
 def summarize(found: Sequence[Row], slots: int) -> Summary:
@@ -155,19 +169,23 @@ def log_path(folder: Path, name: str, attempt: int) -> Path:
     return folder / LOGS / f"{safe}.{attempt}.log"
 
 
-def _row(folder: Path, entry: Entry) -> Row:
-    last, state = entry.last, entry.state
+def _row(folder: Path, entry: Entry, queue: Queue) -> Row:
+    last, state, slurm = entry.last, entry.state, None
     ending = None if last is None else Ending(last.state, None, last.frames, last.metrics or {}, "")
     lines: list[Record] = []
     if last is not None and last.state == RUNNING:
-        if works(last, entry.run_dir):
+        slurm, pending = _in_slurm(last, entry.run_dir, queue)
+        if pending:
+            ending = replace(stand(entry.run_dir, entry.total_frames), state=WAITING)
+        elif works(last, entry.run_dir, queue):
             lines = RunFolder(entry.run_dir).log.tail(_TAIL_BYTES)
             # Evaluations lie far apart; an iteration's episodes are drawn in the same way.
             shown = {SUCCESS: _last(lines, "train/success")}
             ending = Ending(RUNNING, None, _last(lines, "frames"), shown, None)
         else:
             ending = stand(entry.run_dir, entry.total_frames)
-        state = ending.state if state == RUNNING or ending.state in (RUNNING, FINISHED) else state
+        told = state == RUNNING or ending.state in (RUNNING, FINISHED)
+        state = ending.state if told else state
     frames = (ending.frames if ending else None) or 0
     pace = _pace(last, lines, frames)
     remaining = max(entry.total_frames - frames, 0)
@@ -185,7 +203,18 @@ def _row(folder: Path, entry: Entry) -> Row:
         run_dir=entry.run_dir,
         log=None if last is None else log_path(folder, entry.name, last.number),
         error=None if last is None or state == FINISHED else last.error,
+        slurm=slurm,
     )
+
+
+def _in_slurm(attempt: Attempt, run_dir: Path, queue: Queue) -> tuple[str | None, bool]:
+    """Return what Slurm says of an attempt, if it has it, and whether it waits for its start."""
+    if attempt.slurm_id is None:
+        return None, False
+    found = queue.find(attempt.slurm_id)
+    reason = f" ({found.reason})" if found.pending else ""
+    unseen = found.state == UNKNOWN and RunFolder(run_dir).status() != RUNNING
+    return f"{attempt.slurm_id} {found.state}{reason}", found.pending or unseen
 
 
 def _pace(last: Attempt | None, lines: Sequence[Record], frames: int) -> float | None:

@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pgdm.sweep.ledger import FAILED, FINISHED, RUNNING, WAITING, Ledger
+from pgdm.sweep.queue import Queue
 from pgdm.sweep.state import SLOTS, Row, Summary, rows, summarize
 
 PLAIN_INTERVAL_S = 30.0
@@ -31,10 +32,11 @@ class SweepView:
     Args:
         name: of the sweep.
         ledger: what it did.
+        queue: where its jobs stand in Slurm.
     """
 
-    def __init__(self, name: str, ledger: Ledger) -> None:
-        self._name, self._ledger = name, ledger
+    def __init__(self, name: str, ledger: Ledger, queue: Queue) -> None:
+        self._name, self._ledger, self._queue = name, ledger, queue
         self._console = Console(stderr=True)
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
         self._shown_s = self._printed_s = -math.inf
@@ -59,7 +61,7 @@ class SweepView:
         if now - self._shown_s < _REFRESH_S:
             return
         self._shown_s = now
-        found = rows(self._ledger)
+        found = rows(self._ledger, self._queue)
         summary = summarize(found, self._ledger.fact(SLOTS) or 1)
         if self._console.is_terminal:
             self._live.update(live_table(self._name, found, summary), refresh=True)
@@ -74,7 +76,7 @@ class SweepView:
 
     def line(self) -> str:
         """Return how it stands now, in one line."""
-        found = rows(self._ledger)
+        found = rows(self._ledger, self._queue)
         return summary_line(self._name, summarize(found, self._ledger.fact(SLOTS) or 1))
 
     def _print(self, text: str) -> None:
