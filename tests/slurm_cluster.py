@@ -41,7 +41,7 @@ SchedulerParameters=batch_sched_delay=0,sched_interval=2,bf_interval=2
 KillWait=10
 MpiDefault=none
 MailProg=/bin/true
-ReturnToService=2
+ReturnToService=1
 NodeName=n1 NodeHostname={host} NodeAddr=127.0.0.1 Port={ports[1]} CPUs={cores} RealMemory=8000
 NodeName=n2 NodeHostname={host} NodeAddr=127.0.0.1 Port={ports[2]} CPUs={cores} RealMemory=8000
 PartitionName=main Nodes=ALL Default=YES PriorityTier=1 PreemptMode=REQUEUE GraceTime=20

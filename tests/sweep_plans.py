@@ -11,10 +11,27 @@ from typing import IO
 
 from command_line import TINY
 from pgdm.config.store import compose
-from pgdm.sweep.plan import Job, LocalCfg, Plan, SweepCfg, job_key
+from pgdm.sweep.plan import Job, LocalCfg, Plan, SlurmCfg, SweepCfg, job_key
 
 SWEEP = SweepCfg(name=None, dir=None, max_attempts=2, detach=False, dry_run=False)
 LOCAL = LocalCfg(name="local", max_jobs=2, cores_per_job=1, memory_per_job_gb=1.0)
+SLURM = SlurmCfg(
+    name="slurm",
+    partition=None,
+    account=None,
+    qos=None,
+    constraint=None,
+    time_min=60,
+    cores_per_job=1,
+    memory_per_job_gb=1.0,
+    gpus_per_job=0,
+    gres=None,
+    array_parallelism=3,
+    signal_delay_s=45,
+    poll_s=1.0,
+    setup=[],
+    additional_parameters=[],
+)
 
 
 def plan(folder: Path, jobs: int = 3, *overrides: str) -> Plan:
@@ -47,20 +64,24 @@ from pgdm.sweep.launch import run_sweep
 from pgdm.sweep.plan import read_plan
 import sweep_plans
 plan = read_plan(Path(sys.argv[1]))
-sys.exit(run_sweep(plan, sweep_plans.SWEEP, sweep_plans.LOCAL, notify))
+launcher = getattr(sweep_plans, sys.argv[2])
+sys.exit(run_sweep(plan, sweep_plans.SWEEP, launcher, notify))
 """
 
 
-def start(folder: Path, output: IO[str] | None = None) -> subprocess.Popen[str]:
+def start(
+    folder: Path, output: IO[str] | None = None, launcher: str = "LOCAL"
+) -> subprocess.Popen[str]:
     """Start a sweep that is planned, as a process of its own.
 
     Args:
         folder: of the sweep.
         output: where it prints to; None: into pipes.
+        launcher: which of the ones above.
     """
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, str(folder)],
+        [sys.executable, "-c", PROGRAM, str(folder), launcher],
         env=env,
         stdout=output or subprocess.PIPE,
         stderr=output or subprocess.PIPE,

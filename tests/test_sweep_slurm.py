@@ -1,0 +1,243 @@
+"""Sweeps on a real Slurm, whose two nodes are this machine."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import slurm_cluster
+from command_line import TINY, command, process
+from pgdm.sweep.ledger import Ledger
+from pgdm.sweep.plan import Plan, job_key, write_plan
+from pgdm.sweep.queue import parse
+from pgdm.sweep.state import log_path, parent, rows
+from pgdm.tracking.run_folder import read_json
+from pgdm.tracking.run_log import RunLog
+from slurm_cluster import tell
+from sweep_plans import SLURM, broken, plan, start
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        not slurm_cluster.available(), reason="needs the packages slurmctld, slurmd, slurm-client"
+    ),
+]
+JOBS = 12
+Told = dict[str, Any]
+"""Jobs by their names, as ``pgdm sweep status --json`` tells of them."""
+Driver = subprocess.Popen[str]
+LONG = ("eval.interval_frames=0", "checkpoint.interval_s=0.5")
+STEP = 16  # frames of an iteration
+
+
+@pytest.fixture(scope="module")
+def _slurm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    folder = tmp_path_factory.mktemp("slurm")
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("SLURM_CONF", str(folder / "slurm.conf"))
+        with slurm_cluster.slurm(folder):
+            yield
+
+
+@pytest.fixture
+def folder(_slurm: None, library_home: Path, tmp_path: Path) -> Path:
+    return tmp_path / "sweep"
+
+
+@pytest.fixture
+def drive(folder: Path, tmp_path: Path) -> Iterator[Callable[[Plan], Driver]]:
+    """Return what starts a sweep; its output goes to ``driver.txt``."""
+    drivers: list[Driver] = []
+    with open(tmp_path / "driver.txt", "a") as output:
+
+        def begin(whole: Plan) -> Driver:
+            write_plan(whole)
+            Ledger(folder).add(whole)
+            drivers.append(start(folder, output, "SLURM"))
+            return drivers[-1]
+
+        yield begin
+        for driver in drivers:
+            driver.kill()
+            driver.wait()
+
+
+def standings() -> dict[str, str]:
+    fields = "--Format=JobArrayID:40,State:20,exit_code:12,Reason:80"
+    text = tell("squeue", "--me", "--array", "--states=all", "--noheader", fields)
+    found = parse(text)
+    for slurm_id, standing in found.items():
+        if standing.reason == "BeginTime":  # what is queued again would wait for two minutes
+            tell("scontrol", "update", f"jobid={slurm_id}", "StartTime=now")
+    return {slurm_id: standing.state for slurm_id, standing in found.items()}
+
+
+def observe(folder: Path) -> Told:
+    """Return what ``pgdm sweep status`` tells, after a comparison with what Slurm tells."""
+    before = standings()
+    told = json.loads(command("pgdm", "sweep", "status", str(folder), "--json").out)
+    after = standings()
+    steady = {i: state for i, state in before.items() if after.get(i) == state}
+    held = {}
+    for job in told["jobs"]:
+        if job["slurm"] is not None:
+            slurm_id, state = job["slurm"].split()[:2]
+            held[slurm_id] = job["state"]
+            assert steady.get(slurm_id, state) == state
+    ours = {i for i, state in steady.items() if state in ("RUNNING", "PENDING")} - OTHERS
+    assert ours <= set(held)
+    for slurm_id in ours:
+        shown = {"RUNNING": ("running",), "PENDING": ("waiting",)}[steady[slurm_id]]
+        assert held[slurm_id] in (*shown, "cancelled")
+    running = [i for i in ours if steady[i] == "RUNNING"]
+    assert len(running) <= SLURM.array_parallelism
+    return {job["name"]: job for job in told["jobs"]}
+
+
+OTHERS: set[str] = set()
+"""Jobs in Slurm that are none of the sweep."""
+
+
+def until(
+    condition: Callable[[Told], object],
+    folder: Path,
+    driver: Driver | None = None,
+) -> Told:
+    limit = time.monotonic() + 240
+    while True:
+        found = observe(folder)
+        if condition(found):
+            return found
+        assert driver is None or driver.poll() is None, Path("driver.txt").read_text()
+        assert time.monotonic() < limit, found
+        time.sleep(0.5)
+
+
+def on_node(node: str, folder: Path) -> dict[str, str]:
+    """Return the jobs of a sweep that run on a node: name to Slurm's id."""
+    text = tell(
+        "squeue", "--noheader", "--array", "--states=R", f"-w{node}", "--Format=JobArrayID:40"
+    )
+    ids = {e.last.slurm_id: e.name for e in Ledger(folder).entries() if e.last is not None}
+    return {ids[i]: i for i in text.split() if i in ids}
+
+
+def restarts(slurm_id: str) -> int:
+    return int(tell("scontrol", "show", "job", slurm_id).split("Restarts=")[1].split()[0])
+
+
+def with_a_long_job(whole: Plan) -> Plan:
+    first, *others = whole.jobs
+    cfg = dataclasses.replace(first.cfg, total_frames=8 * first.cfg.total_frames)
+    return dataclasses.replace(
+        whole, jobs=(dataclasses.replace(first, cfg=cfg, key=job_key(cfg)), *others)
+    )
+
+
+def has_begun(found: Told, *names: str) -> bool:
+    return all(found[name]["frames"] > 4 * STEP for name in names)
+
+
+def test_whatever_slurm_does_each_job_is_done_once(
+    folder: Path, drive: Callable[[Plan], Driver]
+) -> None:
+    whole = with_a_long_job(plan(folder, JOBS, *LONG, "total_frames=800"))
+    driver = drive(whole)
+    ledger = Ledger(folder)
+
+    # Its time is up.
+    until(lambda found: has_begun(found, "seed=0", "seed=1"), folder, driver)
+    ids = {e.name: e.last.slurm_id for e in ledger.entries() if e.last is not None}
+    assert len({i.partition("_")[0] for i in ids.values()}) == 1  # one array
+    tell("scontrol", "update", f"jobid={ids['seed=0']}", "TimeLimit=1")
+
+    # Somebody ends a job.
+    tell("scancel", ids["seed=1"])
+    until(lambda found: "CANCELLED" in (found["seed=1"]["error"] or ""), folder, driver)
+
+    # Somebody else's jobs come first.
+    until(lambda _: len(on_node("n1", folder)) > 0, folder, driver)
+    preempted = on_node("n1", folder)
+    until(lambda found: has_begun(found, *preempted), folder, driver)
+    other = tell(
+        *("sbatch", "--parsable", "--partition=hi", "--nodelist=n1", "--exclusive"),
+        *("--output=/dev/null", "--wrap=sleep 4"),
+    ).strip()
+    OTHERS.add(other)
+    until(lambda _: standings()[other] == "COMPLETED", folder, driver)
+
+    # The driver is killed; then a node fails.
+    driver.kill()
+    driver.wait()
+    until(lambda _: len(on_node("n2", folder)) > 0, folder)
+    lost = on_node("n2", folder)
+    until(lambda found: has_begun(found, *lost), folder)
+    tell("scontrol", "update", "nodename=n2", "state=down", "reason=test")
+    until(lambda _: not on_node("n2", folder), folder)
+    driver = drive(whole)
+    until(lambda _: parent(ledger), folder, driver)
+    tell("scontrol", "update", "nodename=n2", "state=resume")
+    until(lambda _: driver.poll() is not None, folder)
+    assert driver.returncode == 0, Path("driver.txt").read_text()
+
+    done = {row.name: row for row in rows(ledger)}
+    assert {row.state for row in done.values()} == {"finished"}
+    attempts = ledger.attempts()
+    assert sorted(a.key for a in attempts if a.state == "finished") == sorted(ledger.states())
+    failed = [attempt for attempt in attempts if attempt.state != "finished"]
+    assert [attempt.slurm_id for attempt in failed] == [ids["seed=1"]]
+    assert failed[0].error is not None and "CANCELLED" in failed[0].error
+    assert "SIGUSR2: saving" in log_path(folder, "seed=0", 1).read_text()
+    for some in (["seed=0"], preempted, lost):
+        assert any(restarts(ids[name]) > 0 for name in some)
+    for seed, job in enumerate(whole.jobs):
+        run = folder / "runs" / f"s{seed}"
+        lines = RunLog(run / "metrics.jsonl").read()
+        trained = [line["frames"] for line in lines if line["kind"] == "train"]
+        assert trained == list(range(STEP, job.cfg.total_frames + 1, STEP))
+        assert read_json(run / "result.json")["status"] == "finished"
+
+
+def test_a_failed_job_ctrl_c_and_cancel(folder: Path, drive: Callable[[Plan], Driver]) -> None:
+    whole = broken(plan(folder, 2, *LONG, "total_frames=16000"), 1)
+    driver = drive(whole)
+    ledger = Ledger(folder)
+    until(
+        lambda found: found["seed=1"]["state"] == "failed" and has_begun(found, "seed=0"),
+        folder,
+        driver,
+    )
+    failed = [a for a in ledger.attempts() if a.key == whole.jobs[1].key]
+    assert [(a.state, a.exit_code) for a in failed] == [("failed", 1)] * 2
+    assert all("no-such-motion" in (a.error or "") for a in failed)
+    assert {standings()[a.slurm_id or ""] for a in failed} == {"FAILED"}
+
+    driver.send_signal(signal.SIGINT)
+    assert driver.wait(30) == 130
+    assert "the jobs go on without this process" in Path("driver.txt").read_text()
+    found = observe(folder)
+    assert found["seed=0"]["state"] == "running"
+    assert command("pgdm", "sweep", "cancel", str(folder)).code == 0
+    found = until(lambda found: found["seed=0"]["slurm"] is None, folder)
+    assert found["seed=0"]["state"] == "cancelled"
+    result = read_json(folder / "runs" / "s0" / "result.json")
+    assert (result["status"], result["frames"]) == ("interrupted", found["seed=0"]["frames"])
+    assert standings()[ledger.attempts()[0].slurm_id or ""] in ("CANCELLED", "COMPLETED")
+    assert "SIGTERM" in command("pgdm", "sweep", "logs", str(folder), "seed=0").out
+
+
+def test_slurm_refuses(folder: Path) -> None:
+    settings = ("--offline", "-m", "seed=0,1", *TINY, f"sweep.dir={folder}")
+    outcome = process("pgdm-run", *settings, "hydra/launcher=slurm", "hydra.launcher.partition=gpu")
+    assert outcome.code == 1
+    (error,) = outcome.errors
+    assert "Slurm refused the jobs: " in error and "invalid partition" in error
+    assert {row.state for row in rows(Ledger(folder))} == {"waiting"}
