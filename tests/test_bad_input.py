@@ -19,6 +19,8 @@ from pgdm.config.saved import save_config
 from pgdm.config.store import compose
 from pgdm.rl.checkpoint import write_checkpoint
 
+SLURM = ("-m", "seed=0", "hydra/launcher=slurm")
+
 
 def assert_helps(outcome: Outcome, *said: str, code: int | None = None) -> None:
     """Check the one line, the exit code, and that there is no traceback."""
@@ -83,8 +85,14 @@ def assert_helps(outcome: Outcome, *said: str, code: int | None = None) -> None:
         (["-m", "seed=0", "sweep.detach=maybe"], ["sweep.detach: 'maybe' is not true or false"]),
         (["-m", "seed=0", "hydra.launcher.max_jobs=-1"], ["max_jobs is -1", "at least 0"]),
         (["-m", "seed=0", "hydra.launcher.memory_per_job_gb=0"], ["must be above 0"]),
-        (["-m", "seed=0", "hydra/launcher=basic"], ["unknown hydra/launcher", "valid: local"]),
+        (["-m", "seed=0", "hydra/launcher=basic"], ["unknown hydra/launcher", "local, slurm"]),
         (["-m", "seed=0", "hydra/launcher=slrm"], ["unknown hydra/launcher 'slrm'"]),
+        ([*SLURM, "hydra.launcher.time_min=0"], ["time_min is 0", "at least 1"]),
+        ([*SLURM, "hydra.launcher.time_min=2"], ["signal_delay_s is 120", "only 2 minutes"]),
+        ([*SLURM, "hydra.launcher.cores_per_job=0"], ["cores_per_job is 0", "at least 1"]),
+        ([*SLURM, "hydra.launcher.partition=1"], ["partition: 1 is not text"]),
+        ([*SLURM, "hydra.launcher.queue=gpu"], ["unknown key 'hydra.launcher.queue'"]),
+        ([*SLURM, "hydra.launcher.setup=module"], ["'module' is not a list"]),
         (["-m", "seed=0", "hydra/sweeper=basic"], ["unknown hydra/sweeper", "valid: pgdm"]),
         (["+sweep=validate"], ["unknown sweep file 'validate'; did you mean validate_tcdm50"]),
         (["sweep=validate_tcdm50"], ["with a plus: +sweep=validate_tcdm50"]),

@@ -233,6 +233,13 @@ def test_the_first_signal_asks_the_second_ends() -> None:
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_slurm_sends_several_signals_and_means_one() -> None:
+    with StopRequest(patient=True) as stop:
+        os.kill(os.getpid(), signal.SIGUSR2)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.exit_code == 140
+
+
 # Whole runs.
 
 

@@ -46,6 +46,7 @@ ALLOWED: dict[str, set[str]] = {
     "hydra": {"config.store", "sweep.expand", "cli", "hydra_plugins"},
     "omegaconf": {"config.store", "sweep.expand", "sweep.planning", "cli", "hydra_plugins"},
     "mlflow": {"tracking", "report"},
+    "submitit": {"sweep.slurm"},
 }
 
 Sources = dict[str, str]  # "sim.batch" -> its source; the package's own __init__ is "pgdm"

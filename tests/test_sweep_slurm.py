@@ -162,6 +162,8 @@ def test_whatever_slurm_does_each_job_is_done_once(
     # Somebody ends a job.
     tell("scancel", ids["seed=1"])
     until(lambda found: "CANCELLED" in (found["seed=1"]["error"] or ""), folder, driver)
+    until(lambda _: restarts(ids["seed=0"]), folder, driver)
+    tell("scontrol", "update", f"jobid={ids['seed=0']}", "TimeLimit=60")
 
     # Somebody else's jobs come first.
     until(lambda _: len(on_node("n1", folder)) > 0, folder, driver)

@@ -88,7 +88,7 @@ def watch(folder: Folder) -> None:
     ledger = settled(folder, queue)
     try:
         with SweepView(ledger.fact(NAME) or folder.name, ledger, queue) as view:
-            while parent(ledger) is not None or any(row.slurm for row in rows(ledger, queue)):
+            while parent(ledger) is not None or _goes_on(rows(ledger, queue)):
                 view.update()
                 time.sleep(_POLL_S)
     except KeyboardInterrupt:
@@ -207,6 +207,11 @@ def settled(folder: Path, queue: Queue | None = None) -> Ledger:
         whole = all(state == FINISHED for state in ledger.states().values())
         mirror.close(FINISHED if whole else INTERRUPTED)
     return ledger
+
+
+def _goes_on(found: Sequence[Row]) -> bool:
+    """Return whether Slurm has jobs of a sweep that run, or will, without anybody driving it."""
+    return any(row.slurm is not None and row.state in (WAITING, RUNNING) for row in found)
 
 
 def _chosen(ledger: Ledger, jobs: Sequence[str] | None) -> list[Entry]:

@@ -17,7 +17,11 @@ _ENDED = (
     *("BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY"),
     *("PREEMPTED", "REVOKED", "TIMEOUT", GONE),
 )
-_STUCK = ("launch failed", "jobholdmaxrequeue", "dependencyneversatisfied", "badconstraints")
+_STUCK = (
+    *("accountnotallowed", "badconstraints", "dependencyneversatisfied", "invalidaccount"),
+    *("invalidqos", "jobholdmaxrequeue", "launch failed", "partitionnodelimit"),
+    *("partitiontimelimit", "qosnotallowed"),
+)
 _QUESTION = ("squeue", "--me", "--array", "--states=all", "--noheader")
 _FIELDS = "--Format=JobArrayID:40,State:20,exit_code:12,Reason:80"
 _ANSWER_S = 60.0
@@ -47,7 +51,7 @@ class Standing:
 
     @property
     def stuck(self) -> bool:
-        """Whether Slurm will never start it, for a reason that nobody chose."""
+        """Whether Slurm will never start it, as it is."""
         return self.pending and self.reason.lower().replace("_", " ").startswith(_STUCK)
 
     @property

@@ -142,11 +142,12 @@ class SlurmLauncher:
                 f"squeue has failed for {_SILENT_S / 60:.0f} minutes; start the same command again "
                 "when Slurm is back: the jobs do not need this process"
             )
-        if found.stuck:
-            cancel([slurm_id])
-        elif found.alive:
+        if found.alive and not found.stuck:
             return None
         del self._slurm_ids[task.id]
+        if found.stuck:
+            cancel([slurm_id])
+            return Ended(None, f"Slurm would never start its job {slurm_id}: {found.reason}")
         if found.state in _ITSELF:
             return Ended(found.exit_code, displaced=found.exit_code in STOPPED)
         if found.state == GONE:
@@ -174,8 +175,10 @@ def _work(place: tuple[str, ...]) -> None:
     """Be a worker; runs as one of Slurm's jobs."""
     from submitit import JobEnvironment
 
-    # submitit's own way to requeue would lose what is not saved.
-    signal.signal(signal.SIGUSR2, signal.SIG_IGN)
+    # Until the run listens there is nothing to save. submitit would queue the job again without
+    # saving, and logs signals wherever the program is, even half way through an import.
+    for number in (signal.SIGUSR2, signal.SIGTERM, signal.SIGCONT):
+        signal.signal(number, signal.SIG_IGN)
     # By its name, as on this machine: it lies above.
     worker = importlib.import_module("pgdm.cli.worker")
     # Slurm is told the truth: submitit would take any return for success.
