@@ -143,7 +143,7 @@ def test_what_sbatch_is_given(tmp_path: Path) -> None:
         "module load x",
     } <= set(lines)
     assert not [line for line in lines if "account" in line or "wckey" in line or "gres" in line]
-    assert "--cpus-per-task=4" in lines[-2] and lines[-2].startswith("srun ")
+    assert lines[-1].startswith("srun ") and "--cpus-per-task=4" in lines[-1]
 
 
 def test_no_slurm_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -84,10 +84,10 @@ class Driver:
         except KeyboardInterrupt:
             for worker in self._workers:
                 worker.asked = True
-            self._launcher.end([worker.task for worker in self._workers], 0.0)
+            self._launcher.end(0.0)
             self._reap()
         finally:
-            self._launcher.end([worker.task for worker in self._workers], _STOP_S)
+            self._launcher.end(_STOP_S)
         states = self._ledger.states()
         whole = all(states[key] == FINISHED for key in self._jobs)
         stopped = stop() and not whole

@@ -73,6 +73,6 @@ class Launcher(Protocol):
         """Ask workers to save and stop."""
         ...
 
-    def end(self, tasks: Sequence[Task], patience_s: float) -> None:
+    def end(self, patience_s: float) -> None:
         """End all workers that do not stay: let them save first, but not longer than this."""
         ...

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,21 +99,25 @@ class LocalLauncher:
         code = self._processes[task.id].poll()
         if code is None:
             return None
+        del self._processes[task.id]
         return Ended(code, f"killed by {signal.Signals(-code).name}" if code < 0 else None)
 
     def ask(self, tasks: Sequence[Task]) -> None:
-        """Ask processes once: a second signal would end them without saving."""
-        for task in tasks:
-            if task.id not in self._asked:
-                self._processes[task.id].send_signal(signal.SIGTERM)
-        self._asked |= {task.id for task in tasks}
+        """Ask processes to stop."""
+        self._ask({task.id for task in tasks})
 
-    def end(self, tasks: Sequence[Task], patience_s: float) -> None:
+    def _ask(self, ids: Set[tuple[str, int]]) -> None:
+        """Ask processes once: a second signal would end them without saving."""
+        for task_id in ids - self._asked:
+            self._processes[task_id].send_signal(signal.SIGTERM)
+        self._asked |= ids
+
+    def end(self, patience_s: float) -> None:
         """End processes, and what does not end in time with all that it started."""
         if patience_s:
-            self.ask(tasks)
+            self._ask(self._processes.keys())
         limit = time.monotonic() + patience_s
-        for process in (self._processes[task.id] for task in tasks):
+        for process in self._processes.values():
             try:
                 process.wait(max(limit - time.monotonic(), 0))
             except subprocess.TimeoutExpired:

@@ -126,7 +126,8 @@ def requeue(slurm_id: str) -> None:
 
     Asked from inside the job, which has saved because its time is up or its node is wanted.
     """
-    if told(["squeue", "--noheader", "--jobs", slurm_id, "--format=%T"]).split() == ["RUNNING"]:
+    state = told(["squeue", "--noheader", "--jobs", slurm_id, "--format=%T"]).strip()
+    if state in ("RUNNING", "SIGNALING"):
         told(["scontrol", "requeue", slurm_id])
 
 

@@ -114,12 +114,13 @@ class SlurmLauncher:
             jobs = executor.map_array(_work, places)
         except (FailedJobError, FailedSubmissionError) as error:
             raise SweepError(f"Slurm refused the jobs: {_reason(str(error))}") from error
+        new = {task.id: job.job_id for task, job in zip(tasks, jobs, strict=True)}
+        self._ledger.submitted(new)
+        self._slurm_ids |= new
         for task, job in zip(tasks, jobs, strict=True):
-            self._slurm_ids[task.id] = job.job_id
             log = log_path(self._plan.folder, task.job.name, task.number)
             log.unlink(missing_ok=True)
             log.symlink_to(os.path.relpath(job.paths.stdout, log.parent))
-        self._ledger.submitted(self._slurm_ids)
         self.queue.forget()
 
     def adopt(self, task: Task, attempt: Attempt) -> bool:
@@ -160,9 +161,9 @@ class SlurmLauncher:
         """Have Slurm end jobs; those that run save."""
         cancel(self._slurm_ids[task.id] for task in tasks)
 
-    def end(self, tasks: Sequence[Task], patience_s: float) -> None:
+    def end(self, patience_s: float) -> None:
         """End nothing: Slurm's jobs go on by themselves."""
-        del tasks, patience_s
+        del patience_s
 
 
 def _reason(text: str) -> str:
