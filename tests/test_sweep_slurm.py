@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import signal
 import subprocess
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import pytest
 import slurm_cluster
 from command_line import TINY, command, process
 from pgdm.sweep.ledger import Ledger
-from pgdm.sweep.plan import Plan, job_key, write_plan
+from pgdm.sweep.plan import Plan, write_plan
 from pgdm.sweep.queue import parse
 from pgdm.sweep.state import log_path, parent, rows
 from pgdm.tracking.run_folder import read_json
@@ -111,7 +111,7 @@ def until(
     folder: Path,
     driver: Driver | None = None,
 ) -> Told:
-    limit = time.monotonic() + 240
+    limit = time.monotonic() + 400
     while True:
         found = observe(folder)
         if condition(found):
@@ -134,54 +134,55 @@ def restarts(slurm_id: str) -> int:
     return int(tell("scontrol", "show", "job", slurm_id).split("Restarts=")[1].split()[0])
 
 
-def with_a_long_job(whole: Plan) -> Plan:
-    first, *others = whole.jobs
-    cfg = dataclasses.replace(first.cfg, total_frames=8 * first.cfg.total_frames)
-    return dataclasses.replace(
-        whole, jobs=(dataclasses.replace(first, cfg=cfg, key=job_key(cfg)), *others)
-    )
+def held(folder: Path, driver: Driver | None, *names: str) -> dict[str, str]:
+    """Stop jobs as soon as they have done something; Slurm's next signal to them goes on with them.
 
-
-def has_begun(found: Told, *names: str) -> bool:
-    return all(found[name]["frames"] > 4 * STEP for name in names)
+    Returns:
+        Slurm's id of each by its name.
+    """
+    until(lambda found: all(found[name]["frames"] for name in names), folder, driver)
+    last = {e.name: e.last for e in Ledger(folder).entries() if e.last and e.name in names}
+    for attempt in last.values():
+        attempt.process.signal(signal.SIGSTOP)
+    return {name: attempt.slurm_id or "" for name, attempt in last.items()}
 
 
 def test_whatever_slurm_does_each_job_is_done_once(
     folder: Path, drive: Callable[[Plan], Driver]
 ) -> None:
-    whole = with_a_long_job(plan(folder, JOBS, *LONG, "total_frames=800"))
+    whole = plan(folder, JOBS, *LONG, "total_frames=1200")
     driver = drive(whole)
     ledger = Ledger(folder)
 
-    # Its time is up.
-    until(lambda found: has_begun(found, "seed=0", "seed=1"), folder, driver)
-    ids = {e.name: e.last.slurm_id for e in ledger.entries() if e.last is not None}
-    assert len({i.partition("_")[0] for i in ids.values()}) == 1  # one array
-    tell("scontrol", "update", f"jobid={ids['seed=0']}", "TimeLimit=1")
-
     # Somebody ends a job.
-    tell("scancel", ids["seed=1"])
+    ended = held(folder, driver, "seed=1")
+    tell("scancel", ended["seed=1"])
     until(lambda found: "CANCELLED" in (found["seed=1"]["error"] or ""), folder, driver)
-    until(lambda _: restarts(ids["seed=0"]), folder, driver)
-    tell("scontrol", "update", f"jobid={ids['seed=0']}", "TimeLimit=60")
+
+    # The time of one is up.
+    name, slurm_id = next(iter(on_node("n2", folder).items()))
+    late = held(folder, driver, name)
+    since = tell("squeue", "--noheader", "--array", f"--jobs={slurm_id}", "--Format=TimeUsed:20")
+    minutes = int(since.strip().split(":")[-2]) + 2
+    tell("scontrol", "update", f"jobid={slurm_id}", f"TimeLimit={minutes}")
 
     # Somebody else's jobs come first.
-    until(lambda _: len(on_node("n1", folder)) > 0, folder, driver)
-    preempted = on_node("n1", folder)
-    until(lambda found: has_begun(found, *preempted), folder, driver)
+    until(lambda _: on_node("n1", folder), folder, driver)
+    preempted = held(folder, driver, *on_node("n1", folder))
     other = tell(
         *("sbatch", "--parsable", "--partition=hi", "--nodelist=n1", "--exclusive"),
         *("--output=/dev/null", "--wrap=sleep 4"),
     ).strip()
     OTHERS.add(other)
     until(lambda _: standings()[other] == "COMPLETED", folder, driver)
+    until(lambda _: restarts(late[name]), folder, driver)
+    tell("scontrol", "update", f"jobid={late[name]}", "TimeLimit=60")
 
     # The driver is killed; then a node fails.
     driver.kill()
     driver.wait()
-    until(lambda _: len(on_node("n2", folder)) > 0, folder)
-    lost = on_node("n2", folder)
-    until(lambda found: has_begun(found, *lost), folder)
+    until(lambda _: on_node("n2", folder), folder)
+    lost = held(folder, None, *on_node("n2", folder))
     tell("scontrol", "update", "nodename=n2", "state=down", "reason=test")
     until(lambda _: not on_node("n2", folder), folder)
     driver = drive(whole)
@@ -195,11 +196,14 @@ def test_whatever_slurm_does_each_job_is_done_once(
     attempts = ledger.attempts()
     assert sorted(a.key for a in attempts if a.state == "finished") == sorted(ledger.states())
     failed = [attempt for attempt in attempts if attempt.state != "finished"]
-    assert [attempt.slurm_id for attempt in failed] == [ids["seed=1"]]
+    assert [attempt.slurm_id for attempt in failed] == [ended["seed=1"]]
     assert failed[0].error is not None and "CANCELLED" in failed[0].error
-    assert "SIGUSR2: saving" in log_path(folder, "seed=0", 1).read_text()
-    for some in (["seed=0"], preempted, lost):
-        assert any(restarts(ids[name]) > 0 for name in some)
+    arrays = Counter((a.slurm_id or "").partition("_")[0] for a in attempts)
+    assert sorted(arrays.values()) == [1, JOBS]  # one array, and what was tried again
+    for some in (late, preempted, lost):
+        assert any(restarts(slurm_id) for slurm_id in some.values())
+    assert "SIGUSR2: saving" in log_path(folder, name, 1).read_text()
+    assert any("SIGTERM: saving" in log_path(folder, n, 1).read_text() for n in preempted)
     for seed, job in enumerate(whole.jobs):
         run = folder / "runs" / f"s{seed}"
         lines = RunLog(run / "metrics.jsonl").read()
@@ -213,12 +217,12 @@ def test_a_failed_job_ctrl_c_and_cancel(folder: Path, drive: Callable[[Plan], Dr
     driver = drive(whole)
     ledger = Ledger(folder)
     until(
-        lambda found: found["seed=1"]["state"] == "failed" and has_begun(found, "seed=0"),
+        lambda found: found["seed=1"]["state"] == "failed" and found["seed=0"]["frames"],
         folder,
         driver,
     )
     failed = [a for a in ledger.attempts() if a.key == whole.jobs[1].key]
-    assert [(a.state, a.exit_code) for a in failed] == [("failed", 1)] * 2
+    assert [(a.state, a.exit_code) for a in failed] == [("failed", 2)] * 2  # a name that is unknown
     assert all("no-such-motion" in (a.error or "") for a in failed)
     assert {standings()[a.slurm_id or ""] for a in failed} == {"FAILED"}
 

@@ -23,7 +23,7 @@ from pgdm.sweep.plan import Plan, SlurmCfg
 from pgdm.sweep.queue import GONE, Queue, cancel
 from pgdm.sweep.state import LOGS, log_path
 
-SLURM_LOGS = "slurm"
+_OUTPUT = "slurm"
 """Folder among the logs with what submitit needs, and what Slurm's jobs print."""
 _DISPLACED = ("PREEMPTED", "TIMEOUT")
 _ITSELF = ("COMPLETED", "FAILED")
@@ -104,7 +104,7 @@ class SlurmLauncher:
         from submitit import SlurmExecutor
         from submitit.core.utils import FailedJobError, FailedSubmissionError
 
-        output = self._plan.folder / LOGS / SLURM_LOGS
+        output = self._plan.folder / LOGS / _OUTPUT
         executor = SlurmExecutor(output)
         at_once = self.slots - len(self._slurm_ids)
         executor.update_parameters(**parameters(self._cfg, self._plan.name, at_once))
