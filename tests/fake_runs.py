@@ -85,6 +85,16 @@ def end(folder: RunFolder, status: str = "finished") -> None:
     (folder.path / "result.json").write_text(json.dumps(result))
 
 
+def truth(folder: RunFolder) -> dict[str, dict[int, float]]:
+    """Return what a run has recorded: each metric at each step."""
+    shown: dict[str, dict[int, float]] = {}
+    for record in folder.log.read():
+        for name, value in record.items():
+            if "/" in name:
+                shown.setdefault(name, {})[int(record["frames"])] = float(value)
+    return shown
+
+
 _databases: list[Path] = []
 
 

@@ -200,11 +200,11 @@ def table_of(overrides: list[str], frames: int) -> str:
 
 
 def test_a_reduced_run_is_never_set_against_the_paper_without_saying_so() -> None:
-    text = " ".join(table_of(["+experiment=quickstart"], 450_560).split())
+    text = " ".join(table_of(["+experiment=quickstart"], 524_288).split())
     assert "99.3%" in text  # the paper's
     assert "2.00e-03" in text
     assert "COM error, released [m]" in text
-    assert "not comparable with the paper's figures: 450,560 of 50,000,000 frames" in text
+    assert "not comparable with the paper's figures: 524,288 of 50,000,000 frames" in text
     assert "action=residual, algo=ppo_fast" in text
 
 

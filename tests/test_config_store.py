@@ -60,7 +60,7 @@ def test_every_named_experiment_composes_and_can_be_changed(name: str) -> None:
         (["budget=reduced"], 1_000_000, "reduced"),
         (["budget=smoke"], 8192, "smoke"),
         (["budget=smoke", "total_frames=100_000_000"], 100_000_000, "smoke"),
-        (["+experiment=quickstart"], 450_560, "reduced"),
+        (["+experiment=quickstart"], 524_288, "reduced"),
         (["+experiment=quickstart", "budget=smoke"], 8192, "smoke"),
         (["+experiment=quickstart", "budget=paper"], 50_000_000, "paper"),
     ],

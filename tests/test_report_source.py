@@ -13,6 +13,7 @@ from pgdm.errors import RunError, TrackingError
 from pgdm.report.results import Results
 from pgdm.report.runs import RETURN, SUCCESS, Run
 from pgdm.report.source import Found, find
+from pgdm.tracking.group import Group
 from pgdm.tracking.mlflow import store_uri
 from pgdm.tracking.sync import sync
 from report_runs import FRAMES, make
@@ -106,10 +107,12 @@ def test_mlflow(tmp_path: Path, empty_database: Path) -> None:
     shutil.copy(empty_database, root / "mlflow.db")
     make(root / "a", 0.8, "task=cup-pour1", "algo=ppo_fast")
     make(root / "b", 0.6, "task=cup-pour1", "algo=ppo_fast", "seed=1", state="failed")
+    (root / "sweep").mkdir()
     direct = read(root)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         assert [done.action for done in sync(root)] == ["created", "created"]
+        Group(root / "sweep", store_uri(root), "pgdm").open("sweep", {})  # is no result
         linked = read("pgdm")
         assert {run.path for run in linked.runs} == {run.path for run in direct.runs}
         (root / "a").rename(tmp_path / "gone-a")

@@ -149,6 +149,37 @@ def test_mlflow_out_of_reach_stops_nothing(whole: Plan) -> None:
     assert len(heard) == 1 and uri in heard[0] and "the sweep goes on" in heard[0]
 
 
+def test_mlflow_that_was_away_at_the_start_has_all_in_the_end(
+    whole: Plan, tmp_path: Path, empty_database: Path
+) -> None:
+    place = tmp_path / "away"
+    place.touch()
+    tracking = TrackingCfg("mlflow", store_uri(place), "other")
+    jobs = [
+        dataclasses.replace(j, cfg=dataclasses.replace(j.cfg, tracking=tracking))
+        for j in whole.jobs
+    ]
+    heard: list[str] = []
+    away = dataclasses.replace(whole, jobs=tuple(jobs))
+    mirror = SweepMirror.of(away, heard.append)
+    mirror.open(away)
+    mirror.adopt(jobs[0])
+    folder = make(whole.folder / "runs" / "s0", tracking=dataclasses.asdict(tracking))
+    train(folder)
+    end(folder)
+    assert len(heard) == 1 and "the sweep goes on" in heard[0]
+    place.unlink()
+    place.mkdir()
+    shutil.copy(empty_database, place / "mlflow.db")
+    sync(whole.folder)
+    assert runs(place) == {"s0": ("FINISHED", None)}
+    mirror.close("finished")
+    assert [done.action for done in sync(whole.folder)] == ["completed"]
+    assert runs(place) == {"study": ("FINISHED", None), "s0": ("FINISHED", "study")}
+    assert [done.action for done in sync(whole.folder)] == ["unchanged"]
+    assert len(heard) == 1
+
+
 @pytest.mark.slow
 def test_kills_leave_no_run_twice_and_none_running(library_home: Path, tmp_path: Path) -> None:
     long = ("total_frames=1600", "eval.interval_frames=0", "checkpoint.interval_s=0.5")

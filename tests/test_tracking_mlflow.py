@@ -25,7 +25,7 @@ from fake_runs import (
 )
 from pgdm.errors import UnknownNameError
 from pgdm.tracking import NullTracker, RunFolder, Tracker, TrackingCfg, metric_names, open_tracker
-from pgdm.tracking.mlflow import MAX_POINTS, Mirror, Store, Thin, find_run, store_uri
+from pgdm.tracking.mlflow import MAX_POINTS, Mirror, Store, Thin, find_run, points, store_uri
 from pgdm.tracking.run_folder import LINK, flatten, read_json
 
 __all__ = ["empty_database"]  # a fixture
@@ -179,6 +179,20 @@ def test_resumed_run_without_its_store_brings_its_records_along(tmp_path: Path) 
     ]
 
 
+def test_resumed_run_brings_along_what_was_not_sent_before(tmp_path: Path) -> None:
+    folder = make(tmp_path / "runs" / "a")
+    store = Store.open(store_uri(tmp_path / "runs"), "pgdm")
+    mirror = Mirror(store, folder, None)
+    train(folder, 1, 5)
+    mirror.log(points(folder, folder.log.read()[:3]))  # then MLflow went away, or it was killed
+    tracker = open_tracker(CFG, folder, FACTS)
+    track(tracker, 6, 10)
+    train(folder, 6, 10)
+    tracker.finish("finished")
+    sent = [step for step, _ in steps(store, mirror.run_id, "train/return")]
+    assert sorted(sent) == [i * STEP for i in range(1, 11)]
+
+
 def test_copied_folder_is_a_run_of_its_own_and_a_moved_one_is_not(tmp_path: Path) -> None:
     folder = make(tmp_path / "runs" / "a")
     store = Store.open(store_uri(tmp_path / "runs"), "pgdm")
@@ -193,6 +207,17 @@ def test_copied_folder_is_a_run_of_its_own_and_a_moved_one_is_not(tmp_path: Path
     moved = RunFolder(folder.path.rename(tmp_path / "runs" / "moved"))
     found = find_run(store, moved)
     assert found is not None and found.info.run_id == mirror.run_id
+
+
+def test_machines_have_folders_of_the_same_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = make(tmp_path / "runs" / "a")
+    store = Store.open(store_uri(tmp_path / "runs"), "pgdm")
+    Mirror(store, folder, None)
+    assert find_run(store, folder) is not None
+    monkeypatch.setattr("socket.gethostname", lambda: "another")
+    assert find_run(store, folder) is None
 
 
 @pytest.mark.parametrize("uri", ["http://127.0.0.1:9", "sqlite:////proc/nowhere/mlflow.db"])

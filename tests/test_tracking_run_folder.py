@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 import time
 from pathlib import Path
 
@@ -31,6 +32,7 @@ def test_tags_say_what_the_run_is(tmp_path: Path) -> None:
         "asset_source": "checkout",
         "git": "0123abc",
         "run_dir": str(tmp_path / "a"),
+        "host": socket.gethostname(),
     }
     assert folder.name() == "hammer-use1 s3 pgdm ppo_fast residual"
 

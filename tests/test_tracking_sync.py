@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from fake_runs import LENGTH, STEP, empty_database, end, eval_metrics, make, train
+from fake_runs import LENGTH, STEP, empty_database, end, eval_metrics, make, train, truth
 from pgdm.errors import TrackingError
 from pgdm.tracking import RunFolder, TrackingCfg, open_tracker
 from pgdm.tracking.mlflow import Store, store_uri
@@ -56,20 +56,13 @@ def mirrored(root: Path, folder: RunFolder) -> dict[str, dict[int, float]]:
     return shown
 
 
-def truth(folder: RunFolder) -> dict[str, dict[int, float]]:
-    shown: dict[str, dict[int, float]] = {}
-    for record in folder.log.read():
-        for name, value in record.items():
-            if "/" in name:
-                shown.setdefault(name, {})[int(record["frames"])] = float(value)
-    return shown
-
-
 def test_empty_store_is_filled_and_then_left_alone(root: Path) -> None:
     folders = [finished(root / "x" / f"s{seed}", seed) for seed in range(2)]
     assert actions(root) == {"x/s0": "created", "x/s1": "created"}
     assert actions(root) == {"x/s0": "unchanged", "x/s1": "unchanged"}
     store = Store.open(store_uri(root), "pgdm")
+    store.client.update_run(folders[0].link["run_id"], status="RUNNING")
+    assert actions(root) == {"x/s0": "completed", "x/s1": "unchanged"}
     runs = store.client.search_runs([store.experiment_id])
     assert len(runs) == 2
     for folder in folders:

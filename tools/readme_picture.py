@@ -1,6 +1,6 @@
 """Make the README's picture, three moments of a film, from the video that `make run` names.
 
-python tools/readme_picture.py runs/.../videos/frames_000000450560.mp4
+python tools/readme_picture.py runs/.../videos/frames_000000524288.mp4
 """
 
 from __future__ import annotations

@@ -118,9 +118,11 @@ def _of_experiment(name: str, uri: str, out: Path, progress: Progress) -> list[R
         folders = []
         for number, run in enumerate(runs):
             progress("asking MLflow", number, len(runs))
-            own = Path(run.data.tags["run_dir"])
-            there = (own / CONFIG).exists()
-            folders.append(RunFolder(own if there else _copied(client, run, out / ARTIFACTS)))
+            tags, own = run.data.tags, RunFolder(Path(run.data.tags["run_dir"]))
+            # A folder of that name may be of another run, made on another machine.
+            mine = tags.items() >= own.origin().items() or own.link.get("run_id") == run.info.run_id
+            here = mine and (own.path / CONFIG).exists()
+            folders.append(own if here else RunFolder(_copied(client, run, out / ARTIFACTS)))
     except MlflowException as error:
         raise TrackingError(f"MLflow at {uri}: {str(error).splitlines()[0]}") from error
     return folders
@@ -130,7 +132,10 @@ def _all_runs(client: MlflowClient, experiment_id: str) -> Iterator[MlflowRun]:
     token = None
     while True:
         page = client.search_runs([experiment_id], max_results=_PAGE, page_token=token)
-        yield from (run for run in page if "run_dir" in run.data.tags)  # a sweep's own has none
+        for run in page:
+            tags = run.data.tags
+            if "run_dir" in tags and tags.get("kind") != "sweep":
+                yield run
         token = page.token
         if not token:
             return

@@ -19,7 +19,7 @@ Notify = Callable[[str], None]
 
 
 class SweepMirror:
-    """Tells MLflow of a sweep; what fails there is told once, and the sweep goes on.
+    """Tells MLflow of a sweep; that it fails there is told once, and the sweep goes on.
 
     Args:
         group: the sweep's run; None tells nobody.
@@ -28,6 +28,8 @@ class SweepMirror:
 
     def __init__(self, group: Group | None, notify: Notify) -> None:
         self._group, self._notify = group, notify
+        self._plan: Plan | None = None
+        self._failed = False
 
     @classmethod
     def of(cls, plan: Plan, notify: Notify) -> SweepMirror:
@@ -59,6 +61,7 @@ class SweepMirror:
 
     def open(self, plan: Plan) -> None:
         """Make what MLflow needs, before any job starts."""
+        self._plan = plan
         self._tell(lambda group: group.open(plan.name, {"command": plan.command}))
         for job in plan.jobs:
             if Path(job.cfg.run_dir).exists():
@@ -71,10 +74,14 @@ class SweepMirror:
 
     def correct(self, run_dir: Path) -> None:
         """Give a run that was killed its true status."""
+        if self._failed:  # do not wait for it job by job: `pgdm runs sync` does this too
+            return
         self._tell(lambda group: group.correct(run_dir))
 
     def close(self, status: str) -> None:
         """Tell how the sweep ended."""
+        if self._plan is not None and self._group is not None and not self._group.opened:
+            self.open(self._plan)  # MLflow was out of reach at the start
         self._tell(lambda group: group.close(status))
 
     def _tell(self, what: Callable[[Group], None]) -> None:
@@ -83,5 +90,8 @@ class SweepMirror:
         try:
             what(self._group)
         except TrackingError as error:
-            self._group = None
-            self._notify(f"{error}; the sweep goes on, `pgdm runs sync` fills in what is missing")
+            if not self._failed:
+                self._notify(
+                    f"{error}; the sweep goes on, `pgdm runs sync` fills in what is missing"
+                )
+            self._failed = True

@@ -24,14 +24,20 @@ class Group:
     def __init__(self, folder: Path, uri: str, experiment: str) -> None:
         self.folder, self.uri, self._experiment = folder.absolute(), uri, experiment
 
+    @property
+    def opened(self) -> bool:
+        """Whether its run was made in this store."""
+        return self._link.get("uri") == self.uri
+
     def open(self, name: str, tags: Mapping[str, str]) -> None:
         """Make store, experiment and run if they are missing, and say that it is running."""
         from mlflow.entities import RunTag
 
         with _told(self.uri):
             store = Store.open(self.uri, self._experiment)
-            mine = {"run_dir": str(self.folder), "kind": "sweep", **tags}
-            run = find_run(store, RunFolder(self.folder))
+            folder = RunFolder(self.folder)
+            mine = {**folder.origin(), "kind": "sweep", **tags}
+            run = find_run(store, folder)
             if run is None:
                 run = store.client.create_run(store.experiment_id, run_name=name, tags=mine)
             run_id = run.info.run_id

@@ -13,6 +13,7 @@ from typing import Any
 
 from pgdm.tracking.mlflow import SYNCED, Mirror, Point, Store, Thin, find_run, points, store_uri
 from pgdm.tracking.run_folder import FACTS, RunFolder, runs_root
+from pgdm.tracking.sync import history, lacking
 from pgdm.tracking.tracker import Tracker, TrackingCfg
 
 RETRY_S = 30.0
@@ -38,6 +39,7 @@ class MlflowTracker(Tracker):
         self._cfg, self._folder = cfg, folder
         self._uri = cfg.uri or folder.parent().get("uri") or store_uri(runs_root(folder.path))
         self._facts = {name: facts[name] for name in FACTS if facts.get(name) is not None}
+        self._attempts = int(folder.link.get("attempts", 0)) + 1
         self._earlier = self._folder.log.read()
         self._thin = Thin(self._folder.total_frames())
         self._points: deque[Point] = deque()
@@ -106,21 +108,23 @@ class MlflowTracker(Tracker):
         self._not_before = 0.0
 
     def _connected(self) -> Mirror:
-        """Return the mirror, opened at the first call; an earlier run's records come first."""
+        """Return the mirror, opened at the first call; what is missing of earlier comes first."""
         if self._mirror is not None:
             return self._mirror
         store = Store.open(self._uri, self._cfg.experiment)
         run = find_run(store, self._folder)
         mirror = Mirror(store, self._folder, run)
-        attempts = int(self._folder.link.get("attempts", 0)) + 1
-        mirror.link({**self._facts, "attempts": attempts})
+        mirror.link({**self._facts, "attempts": self._attempts})
+        earlier = points(self._folder, self._earlier)
         if run is None:
-            mirror.log(points(self._folder, self._earlier))
-            if self._earlier:
+            mirror.log(earlier)
+            if earlier:
                 mirror.posters()
         else:
             mirror.set_status("running")
-        mirror.describe({"attempts": str(attempts)})
+            # MLflow was out of reach before, maybe, or the process was killed.
+            mirror.log(lacking(earlier, history(store, run)))
+        mirror.describe({"attempts": str(self._attempts)})
         mirror.artifacts()
         self._mirror = mirror
         return mirror

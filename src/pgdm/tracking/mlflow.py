@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import shutil
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +17,14 @@ from filelock import FileLock
 from pgdm.errors import TrackingError
 from pgdm.tracking import metric_names
 from pgdm.tracking.run_folder import ARTIFACTS, LINK, RunFolder, flatten, write_json
-from pgdm.tracking.run_log import Record, metrics_of
+from pgdm.tracking.run_log import FILE_NAME, Record, metrics_of
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Run
 
 DATABASE = "mlflow.db"
+PARENT_TAG = "mlflow.parentRunId"
 MAX_POINTS = 1500
 """Points of one metric in MLflow at most, whose pages get slow beyond; the run log keeps all."""
 SYNCED = "synced"
@@ -158,10 +161,9 @@ def find_run(store: Store, folder: RunFolder) -> Run | None:
             origin = Path(run.data.tags.get("run_dir", folder.path))
             if origin == folder.path or not origin.exists():
                 return run
-    path = str(folder.path).replace("'", "''")
-    found = store.client.search_runs(
-        [store.experiment_id], f"tags.run_dir = '{path}'", max_results=1
-    )
+    origin = {name: text.replace("'", "''") for name, text in folder.origin().items()}
+    where = " and ".join(f"tags.{name} = '{text}'" for name, text in origin.items())
+    found = store.client.search_runs([store.experiment_id], where, max_results=1)
     return found[0] if found else None
 
 
@@ -183,7 +185,7 @@ class Mirror:
                 store.experiment_id,
                 start_time=start_ms,
                 run_name=folder.name(),
-                tags={"run_dir": str(folder.path)},
+                tags=folder.origin(),
             )
         self.run_id = run.info.run_id
         self._params = dict(run.data.params)
@@ -208,7 +210,7 @@ class Mirror:
         texts["mlflow.note.content"] = f"`{self._folder.path}`\n\n{metric_names.markdown()}"
         texts["mlflow.source.name"] = "pgdm-run"
         if parent := self._folder.parent().get("run_id"):
-            texts["mlflow.parentRunId"] = parent
+            texts[PARENT_TAG] = parent
         if "git" in texts:
             texts["mlflow.source.git.commit"] = texts["git"].rstrip("+")
         all_tags = [RunTag(name, text) for name, text in texts.items()]
@@ -239,7 +241,11 @@ class Mirror:
 
     def artifact(self, path: Path, place: str) -> None:
         """Copy one file."""
-        self._client.log_artifact(self.run_id, str(path), place or None)
+        with tempfile.TemporaryDirectory(prefix="pgdm-") as folder:
+            if path.name == FILE_NAME:
+                # A server takes what is added while it is sent for the start of another request.
+                path = Path(shutil.copy2(path, folder))
+            self._client.log_artifact(self.run_id, str(path), place or None)
 
     def poster(self, path: Path, frames: int) -> None:
         """Show a picture on the run's page, with a slider over frames."""

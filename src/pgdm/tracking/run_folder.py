@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
+import socket
 import time
 from collections.abc import Iterator, Mapping
 from functools import cached_property
@@ -103,7 +104,11 @@ class RunFolder:
         found = {tag: self.setting(key) for tag, key in TAGS.items()}
         found |= {fact: self.result.get(fact, self.link.get(fact)) for fact in FACTS}
         texts = {name: _text(value) for name, value in found.items() if value is not None}
-        return {**texts, "run_dir": str(self.path)}
+        return {**texts, **self.origin()}
+
+    def origin(self) -> dict[str, str]:
+        """Return where the run lies; other machines have folders of the same name."""
+        return {"run_dir": str(self.path), "host": socket.gethostname()}
 
     def name(self) -> str:
         """Return a short name for people; what differs most comes first, as lists cut its end."""

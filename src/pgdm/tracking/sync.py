@@ -5,14 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pgdm.errors import RunError, TrackingError
-from pgdm.tracking.mlflow import SYNCED, Mirror, Store, find_run, points, store_uri
+from pgdm.tracking.mlflow import (
+    PARENT_TAG,
+    STATUS,
+    SYNCED,
+    Mirror,
+    Point,
+    Store,
+    find_run,
+    points,
+    store_uri,
+)
 from pgdm.tracking.run_folder import RunFolder, find_runs
 from pgdm.tracking.run_log import metrics_of
 
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
 EXPERIMENT = "pgdm"
 """Where runs go whose configuration names no experiment."""
+
+History = dict[str, dict[int, float]]
+"""Metric to value at each step."""
 
 
 @dataclass(frozen=True)
@@ -71,15 +88,15 @@ def sync_run(store: Store, folder: RunFolder) -> Synced:
     fingerprint = folder.fingerprint()
     action = "created" if run is None else "completed"
     wanted = points(folder, folder.log.read())
-    if run is not None and run.data.tags.get(SYNCED) == fingerprint:
+    if run is not None and _complete(run, folder, fingerprint):
         action, wanted = "unchanged", []
     elif run is not None:
-        there = _history(store, run.info.run_id, run.data.metrics)
+        there = history(store, run)
         if _contradicts(there, folder):
             store.client.delete_run(run.info.run_id)
             run, action = None, "rebuilt"
         else:
-            wanted = [(step, at, _missing(there, step, m)) for step, at, m in wanted]
+            wanted = lacking(wanted, there)
     mirror = Mirror(store, folder, run)
     mirror.log(wanted)
     if run is None:
@@ -92,16 +109,32 @@ def sync_run(store: Store, folder: RunFolder) -> Synced:
     return Synced(folder, action)
 
 
-def _history(store: Store, run_id: str, names: dict[str, float]) -> dict[str, dict[int, float]]:
-    """Return the last value of each metric at each step."""
-    found: dict[str, dict[int, float]] = {}
-    for name in names:
-        entries = store.client.get_metric_history(run_id, name)
+def _complete(run: Run, folder: RunFolder, fingerprint: str) -> bool:
+    """Return whether a run has all records of a folder, its status and its parent."""
+    tags, parent = run.data.tags, folder.parent().get("run_id")
+    nested = parent in (None, tags.get(PARENT_TAG))
+    told = run.info.status == STATUS[folder.status()]
+    return nested and told and tags.get(SYNCED) == fingerprint
+
+
+def history(store: Store, run: Run) -> History:
+    """Return what a run shows: the last value of each metric at each step."""
+    found: History = {}
+    for name in run.data.metrics:
+        entries = store.client.get_metric_history(run.info.run_id, name)
         found[name] = {e.step: e.value for e in sorted(entries, key=lambda e: e.timestamp)}
     return found
 
 
-def _contradicts(there: dict[str, dict[int, float]], folder: RunFolder) -> bool:
+def lacking(wanted: list[Point], there: History) -> list[Point]:
+    """Return the points without the metrics that are there."""
+    return [
+        (step, at, {name: value for name, value in m.items() if step not in there.get(name, {})})
+        for step, at, m in wanted
+    ]
+
+
+def _contradicts(there: History, folder: RunFolder) -> bool:
     """Return whether MLflow shows something that the run's records do not say."""
     truth = {
         (name, int(record["frames"])): value
@@ -113,9 +146,3 @@ def _contradicts(there: dict[str, dict[int, float]], folder: RunFolder) -> bool:
         for name, steps in there.items()
         for step, value in steps.items()
     )
-
-
-def _missing(
-    there: dict[str, dict[int, float]], step: int, metrics: dict[str, float]
-) -> dict[str, float]:
-    return {name: value for name, value in metrics.items() if step not in there.get(name, {})}
