@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import time
@@ -73,7 +74,12 @@ def slurm(folder: Path) -> Iterator[None]:
         yield
     finally:
         subprocess.run(["scancel", "--quiet", "--me"], check=False)
-        subprocess.run(["scontrol", "shutdown"], check=False)
+        limit = time.monotonic() + 20
+        while tell("squeue", "--noheader") and time.monotonic() < limit:
+            time.sleep(0.2)
+        for file in folder.glob("*.pid"):  # a node that is down would not hear scontrol shutdown
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(file.read_text()), signal.SIGKILL)
 
 
 def tell(*command: str) -> str:
