@@ -13,8 +13,10 @@ from pathlib import Path
 import pytest
 
 from command_line import command
+from pgdm.errors import SweepError
+from pgdm.sweep.launch import held
 from pgdm.sweep.ledger import Ledger
-from pgdm.sweep.plan import Plan, write_plan
+from pgdm.sweep.plan import Plan, read_plan, write_plan
 from pgdm.sweep.state import log_path, parent, rows
 from pgdm.tracking.run_folder import claimed, read_json
 from pgdm.tracking.run_log import RunLog
@@ -91,10 +93,9 @@ def test_a_signal_saves_and_the_same_command_goes_on(folder: Path, number: signa
     ledger = planned(plan(folder, 2, *LONG))
     process = start(folder)
     until(lambda: frames(folder, 0) > 64 and frames(folder, 1) > 64, process)
-    second = start(folder)
-    _, err = second.communicate(timeout=60)
-    assert second.returncode == 1
-    assert f"is run by process {process.pid} already" in err
+    refused = pytest.raises(SweepError, match=f"is run by process {process.pid} already")
+    with refused, held(read_plan(folder)):
+        pass
     process.send_signal(number)
     _, err = process.communicate(timeout=120)
     assert process.returncode == 128 + number, err
