@@ -147,6 +147,17 @@ def held(folder: Path, driver: Driver | None, *names: str) -> dict[str, str]:
     return {name: attempt.slurm_id or "" for name, attempt in last.items()}
 
 
+def held_on(node: str, folder: Path, driver: Driver | None) -> dict[str, str]:
+    """Stop the jobs on a node that have done something, as ``held``; at least one is not done."""
+    while True:
+        found = until(
+            lambda found: any(found[n]["frames"] for n in on_node(node, folder)), folder, driver
+        )
+        stopped = held(folder, driver, *(n for n in on_node(node, folder) if found[n]["frames"]))
+        if still := {n: i for n, i in stopped.items() if n in on_node(node, folder)}:
+            return still
+
+
 def test_whatever_slurm_does_each_job_is_done_once(
     folder: Path, drive: Callable[[Plan], Driver]
 ) -> None:
@@ -167,8 +178,7 @@ def test_whatever_slurm_does_each_job_is_done_once(
     tell("scontrol", "update", f"jobid={slurm_id}", f"TimeLimit={minutes}")
 
     # Somebody else's jobs come first.
-    until(lambda _: on_node("n1", folder), folder, driver)
-    preempted = held(folder, driver, *on_node("n1", folder))
+    preempted = held_on("n1", folder, driver)
     other = tell(
         *("sbatch", "--parsable", "--partition=hi", "--nodelist=n1", "--exclusive"),
         *("--output=/dev/null", "--wrap=sleep 4"),
@@ -181,8 +191,7 @@ def test_whatever_slurm_does_each_job_is_done_once(
     # The driver is killed; then a node fails.
     driver.kill()
     driver.wait()
-    until(lambda _: on_node("n2", folder), folder)
-    lost = held(folder, None, *on_node("n2", folder))
+    lost = held_on("n2", folder, None)
     tell("scontrol", "update", "nodename=n2", "state=down", "reason=test")
     until(lambda _: not on_node("n2", folder), folder)
     driver = drive(whole)
