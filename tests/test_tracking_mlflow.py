@@ -25,8 +25,9 @@ from fake_runs import (
 )
 from pgdm.errors import UnknownNameError
 from pgdm.tracking import NullTracker, RunFolder, Tracker, TrackingCfg, metric_names, open_tracker
-from pgdm.tracking.mlflow import MAX_POINTS, Mirror, Store, Thin, find_run, points, store_uri
+from pgdm.tracking.mlflow import Mirror, Store, find_run, store_uri
 from pgdm.tracking.run_folder import LINK, flatten, read_json
+from pgdm.tracking.thin import MAX_POINTS, Thin, points
 
 __all__ = ["empty_database"]  # a fixture
 
@@ -310,6 +311,35 @@ def test_four_processes_start_at_once_without_a_database(tmp_path: Path) -> None
     for run in runs:
         assert len(steps(store, run.info.run_id, "train/return")) == LENGTH
     assert not (tmp_path / "mlruns").exists()
+
+
+@pytest.mark.slow
+def test_a_kill_leaves_no_half_made_store_without_a_database(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    program = "import sys; from pgdm.tracking.mlflow import Store; Store.open(sys.argv[1], 'pgdm')"
+    for tables in (1, 10, 25):
+        maker = subprocess.Popen([sys.executable, "-c", program, store_uri(root)])
+        while made(root, maker.pid) < tables:
+            assert maker.poll() is None, "it should have been killed before its end"
+        maker.kill()
+        maker.wait()
+        assert not (root / "mlflow.db").exists()
+    store = Store.open(store_uri(root), "pgdm")
+    assert store.client.search_runs([store.experiment_id]) == []
+    assert sorted(p.name for p in root.iterdir()) == ["mlflow.db", "mlflow.db.lock"]
+
+
+def made(root: Path, pid: int) -> int:
+    """Return how many tables a process has made so far."""
+    for file in root.glob(f"*{pid}-mlflow.db"):
+        database = sqlite3.connect(file)
+        try:
+            return len(database.execute("select 1 from sqlite_master").fetchall())
+        except sqlite3.OperationalError:  # in the middle of a change
+            return 0
+        finally:
+            database.close()
+    return 0
 
 
 def test_database_speaks_to_nobody_and_leaves_nothing_beside(tmp_path: Path) -> None:

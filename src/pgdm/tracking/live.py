@@ -11,9 +11,10 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
-from pgdm.tracking.mlflow import SYNCED, Mirror, Point, Store, Thin, find_run, points, store_uri
+from pgdm.tracking.mlflow import SYNCED, Mirror, Store, find_run, store_uri
 from pgdm.tracking.run_folder import FACTS, RunFolder, runs_root
 from pgdm.tracking.sync import history, lacking
+from pgdm.tracking.thin import Point, Thin, points
 from pgdm.tracking.tracker import Tracker, TrackingCfg
 
 RETRY_S = 30.0

@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock
 
 from pgdm.errors import TrackingError
+from pgdm.paths import TEMPORARY, replacing
 from pgdm.tracking import metric_names
 from pgdm.tracking.run_folder import ARTIFACTS, LINK, RunFolder, flatten, write_json
-from pgdm.tracking.run_log import FILE_NAME, Record, metrics_of
+from pgdm.tracking.run_log import FILE_NAME
+from pgdm.tracking.thin import Point
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -25,8 +27,6 @@ if TYPE_CHECKING:
 
 DATABASE = "mlflow.db"
 PARENT_TAG = "mlflow.parentRunId"
-MAX_POINTS = 1500
-"""Points of one metric in MLflow at most, whose pages get slow beyond; the run log keeps all."""
 SYNCED = "synced"
 """Tag with the fingerprint of the records that are in MLflow, all of them."""
 STATUS = {
@@ -51,9 +51,6 @@ _SETTINGS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
 }
-
-Point = tuple[int, int, dict[str, float]]
-"""Frames, time in ms since the epoch, and finite metrics by name."""
 
 
 def store_uri(root: Path) -> str:
@@ -86,12 +83,14 @@ class Store:
         """
         file = sqlite_file(uri)
         with _only_one(file):
+            if file is not None and not file.exists():
+                _create(file)
             client = connect(uri)
             return cls(client, uri, _experiment(client, experiment, file))
 
 
 def connect(uri: str) -> MlflowClient:
-    """Return a quiet client of a store; a SQLite file that is missing is made."""
+    """Return a quiet client of a store that is there."""
     os.environ.update({k: v for k, v in _SETTINGS.items() if k not in os.environ})
     from mlflow import MlflowClient
 
@@ -122,6 +121,14 @@ def _only_one(file: Path | None) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def _create(file: Path) -> None:
+    """Make a database whole or not at all: MLflow does not go on with a half-made one."""
+    for stale in file.parent.glob(f"{TEMPORARY}*{file.name}*"):  # of a process that was killed
+        stale.unlink()
+    with replacing(file) as temp:
+        connect(f"sqlite:///{temp}")
 
 
 def _experiment(client: MlflowClient, name: str, file: Path | None) -> str:
@@ -267,33 +274,3 @@ class Mirror:
         else:
             end_ms = None if end_s is None else int(1000 * end_s)
             self._client.set_terminated(self.run_id, STATUS.get(status, "FAILED"), end_ms)
-
-
-class Thin:
-    """Passes at most ``MAX_POINTS`` points of a run, and every evaluation.
-
-    Args:
-        total_frames: the run's length.
-    """
-
-    def __init__(self, total_frames: int) -> None:
-        self._stride = max(1, total_frames // MAX_POINTS)
-        self._bucket = -1
-
-    def passes(self, frames: int, metrics: Mapping[str, float]) -> bool:
-        """Return whether to mirror this point; points come in the order of frames."""
-        bucket, before = frames // self._stride, self._bucket
-        self._bucket = bucket
-        return bucket != before or any(name.startswith("eval") for name in metrics)
-
-
-def points(folder: RunFolder, records: Iterable[Record]) -> list[Point]:
-    """Return what of a run's records MLflow shows."""
-    thin, start = Thin(folder.total_frames()), folder.started()
-    found = []
-    for record in records:
-        frames, metrics = int(record["frames"]), metrics_of(record)
-        if metrics and thin.passes(frames, metrics):
-            at = int(1000 * (start + float(record.get("time_s", 0.0))))
-            found.append((frames, at, metrics))
-    return found

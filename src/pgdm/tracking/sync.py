@@ -13,14 +13,13 @@ from pgdm.tracking.mlflow import (
     STATUS,
     SYNCED,
     Mirror,
-    Point,
     Store,
     find_run,
-    points,
     store_uri,
 )
 from pgdm.tracking.run_folder import RunFolder, find_runs
 from pgdm.tracking.run_log import metrics_of
+from pgdm.tracking.thin import Point, points
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
