@@ -97,7 +97,7 @@ def test_finished_rows_restart_and_keep_their_last_observation() -> None:
     assert terminated.all() and not truncated.any()
     torch.testing.assert_close(obs, start, rtol=0, atol=0)
     assert not torch.equal(info["final_obs"], obs)
-    metrics = info["episodes"]
+    metrics = info["episodes"].metrics()
     assert {"success", "com_error", "com_error_released", "ori_error", "lifted", "dropped"} <= set(
         metrics
     )
@@ -150,7 +150,7 @@ def test_a_diverging_simulation_ends_alone_and_is_dumped(
         assert truncated.tolist() == [False, k == 0, False]
         assert torch.equal(obs[[0, 2]], expected[0][[0, 2]])
         if k == 0:
-            assert info["episodes"]["diverged"].tolist() == [1.0]
+            assert info["episodes"].metrics()["diverged"].tolist() == [1.0]
             assert not terminated.any()
             torch.testing.assert_close(obs[1], calm.reset(np.array([1]))[1], rtol=0, atol=0)
     dumps = list((tmp_path / "diverged").glob("*.npz"))

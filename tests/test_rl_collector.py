@@ -68,7 +68,8 @@ def test_metrics_are_means_over_the_episodes_that_finished() -> None:
     metrics = rollout.metrics()
     ends = int((rollout.terminated | rollout.truncated).sum())
     assert metrics["episodes"] == ends >= 8
-    lengths = torch.cat(rollout.episodes["length"]).double()
+    lengths = torch.cat([ended.metrics()["length"] for ended in rollout.finished]).double()
+    assert len(lengths) == ends
     assert metrics["length"] == float(lengths.mean())
     assert metrics["reward"] == pytest.approx(float(rollout.reward.mean()))
 

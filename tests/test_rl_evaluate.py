@@ -13,7 +13,7 @@ from pgdm.rl.checkpoint import CheckpointFolder, write_checkpoint
 from pgdm.rl.evaluate import Evaluator, load_policy, run_episodes, summarise
 from pgdm.rl.trainer import Extras, Trainer
 from pgdm.seeding import torch_stream
-from toy_envs import TOY, PointEnv, trainer_cfg
+from toy_envs import TOY, Ended, PointEnv, trainer_cfg
 
 
 class Still:
@@ -45,7 +45,8 @@ class LadderEnv(PointEnv):
         self._t = self._t + 1
         done = self._t >= self.ladder
         self.finished += done
-        episodes = {"length": self._t[done], "finished": self.finished[done]} if done.any() else {}
+        metrics = {"length": self._t[done], "finished": self.finished[done]}
+        episodes = Ended(metrics) if done.any() else None
         info = {"final_obs": self._obs(), "episodes": episodes, "terms": {}}
         self._t = self._t.masked_fill(done, 0)
         never = torch.zeros_like(done)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -51,6 +52,20 @@ def trainer_cfg(algo: PPOCfg = TOY, **changes: Any) -> TrainerCfg:
     return replace(cfg, **changes)
 
 
+@dataclass(frozen=True)
+class Ended:
+    """Episodes that finished."""
+
+    values: dict[str, Tensor]
+
+    def metrics(self) -> dict[str, Tensor]:
+        return self.values
+
+    def with_later(self, later: Sequence[Self]) -> Ended:
+        every = (self.values, *(ended.values for ended in later))
+        return Ended({name: torch.cat([v[name] for v in every]) for name in self.values})
+
+
 class PointEnv:
     """A point in the plane that should be pushed to the origin, with bits of randomness.
 
@@ -79,14 +94,16 @@ class PointEnv:
         terminated = self._t >= 20
         truncated = (self._pos.abs() > 2).any(1) & ~terminated
         done = terminated | truncated
-        info: dict[str, Any] = {"final_obs": self._obs(), "terms": {"near": reward}, "episodes": {}}
+        info: dict[str, Any] = {
+            "final_obs": self._obs(),
+            "terms": {"near": reward},
+            "episodes": None,
+        }
         if done.any():
             close = (self._pos[done].norm(dim=1) < 0.2).float()
-            info["episodes"] = {
-                "return": self._return[done],
-                "success": close,
-                "length": self._t[done],
-            }
+            info["episodes"] = Ended(
+                {"return": self._return[done], "success": close, "length": self._t[done]}
+            )
             self._restart(done)
         return self._obs(), reward, terminated, truncated, info
 
@@ -156,7 +173,7 @@ class ScriptedEnv:
         final = self._obs()
         done = self._terminated[t] | self._truncated[t]
         obs = torch.where(done[:, None], -final, final)  # after a restart: the negative
-        info = {"final_obs": final, "terms": {"script": self._reward[t]}, "episodes": {}}
+        info = {"final_obs": final, "terms": {"script": self._reward[t]}, "episodes": None}
         return obs, self._reward[t], self._terminated[t], self._truncated[t], info
 
     def _obs(self) -> Tensor:
@@ -191,5 +208,5 @@ class FreeEnv(ScriptedEnv):
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         self.t += 1
         obs = self._obs()
-        info = {"final_obs": obs, "terms": {}, "episodes": {}}
+        info = {"final_obs": obs, "terms": {}, "episodes": None}
         return obs, self._rewards[self.t % 16], self._no, self._no, info

@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from pgdm.envs.divergence import History
+from pgdm.envs.finished import Finished
 from pgdm.errors import RunError, UnknownNameError
 from pgdm.mdp.actions import ActionMap
 from pgdm.mdp.context import StepContext
-from pgdm.mdp.metrics import Episodes, episode_metrics
+from pgdm.mdp.metrics import Episodes
 from pgdm.mdp.observations import Observe
 from pgdm.mdp.recipe import Recipe
 from pgdm.motion.reference import ObjectReference
@@ -70,7 +71,6 @@ class BatchEnv:
         )
         n, horizon = self.num_envs, len(mdp.reference)
         self._t = torch.zeros(n, dtype=torch.int64)
-        self._return = torch.zeros(n, dtype=torch.float64)
         # Of each reward term, (2, K, N): weighted, then raw, summed over the episode.
         self._term_sums = torch.zeros(2, len(self._names), n, dtype=torch.float64)
         self._pos = torch.zeros(n, horizon, 3, dtype=torch.float64)
@@ -94,7 +94,6 @@ class BatchEnv:
         self.sim.reset(ids, self.mdp.start.qpos, self.mdp.start.qvel)
         rows = torch.from_numpy(ids)
         self._t[rows] = 0
-        self._return[rows] = 0.0
         self._term_sums[:, :, rows] = 0.0
         obs, self._pos[rows, 0], self._quat[rows, 0] = self._start
         if len(ids) == self.num_envs:
@@ -112,8 +111,8 @@ class BatchEnv:
             terminated (N,) bool, the object was lost or the motion ended; truncated (N,) bool,
             the simulation diverged; info with ``final_obs`` (N, D), ``qpos`` (N, nq),
             ``object_error_m`` (N,), ``success`` (N,) bool, ``terms`` {name: (N,)} weighted
-            rewards, ``raw_terms`` before weighting, ``ends`` {name: (N,) bool} and ``episodes``
-            {metric: (k,)} of the k episodes that finished.
+            rewards, ``raw_terms`` before weighting, ``ends`` {name: (N,) bool} and ``episodes``,
+            the `Finished` episodes, or None.
         """
         if not self._auto_reset and bool((self._t >= len(self.mdp.reference) - 1).any()):
             raise RunError("the motion is over in at least one simulation; reset it before step()")
@@ -140,7 +139,6 @@ class BatchEnv:
         terms = self._weights * raw
         reward = terms.sum(0)
         terminated = torch.stack(tuple(ends.values())).any(0)
-        self._return += reward
         self._term_sums += torch.stack((terms, raw))
         self._pos[self._rows, self._t], self._quat[self._rows, self._t] = self._poses(
             state, diverged if some_diverged else None
@@ -152,10 +150,10 @@ class BatchEnv:
             "qpos": state.qpos,
             "object_error_m": context.object_error,
             "success": context.object_error <= self.mdp.recipe.metrics.success_threshold_m,
-            "terms": dict(zip(self._names, terms, strict=True)),
-            "raw_terms": dict(zip(self._names, raw, strict=True)),
+            "terms": dict(zip(self._names, terms.unbind(), strict=True)),
+            "raw_terms": dict(zip(self._names, raw.unbind(), strict=True)),
             "ends": ends,
-            "episodes": self._metrics(finished, diverged, ends) if len(finished) else {},
+            "episodes": self._finished(finished, diverged, ends) if len(finished) else None,
         }
         self._obs = final
         if self._auto_reset and len(finished):
@@ -192,7 +190,6 @@ class BatchEnv:
             "rows": torch.from_numpy(self.sim.rows.copy()),
             "t": self._t.clone(),
             "obs": self._obs.clone(),
-            "return": self._return.clone(),
             "term_sums": self._term_sums.clone(),
             "pos": self._pos.clone(),
             "quat": self._quat.clone(),
@@ -208,7 +205,6 @@ class BatchEnv:
             self._randomize.load_state_dict(state["randomize"], self.sim)
         self.sim.restore(state["rows"].numpy())
         self._t, self._obs = state["t"].clone(), state["obs"].clone()
-        self._return = state["return"].clone()
         self._term_sums = state["term_sums"].clone()
         self._pos, self._quat = state["pos"].clone(), state["quat"].clone()
         self._weights = state["weights"].clone()
@@ -244,15 +240,12 @@ class BatchEnv:
             torch.where(keep, self._quat[self._rows, last], state.object_quat),
         )
 
-    def _metrics(
-        self, rows: Tensor, diverged: Tensor, ends: dict[str, Tensor]
-    ) -> dict[str, Tensor]:
-        """Return the metrics of the episodes that finished in ``rows`` (k,), each (k,)."""
-        episodes = Episodes(self._pos[rows], self._quat[rows], self._t[rows])
-        metrics = episode_metrics(episodes, self.mdp.reference, self.mdp.recipe.metrics)
-        metrics["return"] = self._return[rows]
-        metrics["diverged"] = diverged[rows].double()
-        metrics |= {f"end/{name}": flag[rows].double() for name, flag in ends.items()}
-        for kind, sums in zip(("term", "raw"), self._term_sums[:, :, rows], strict=True):
-            metrics |= {f"{kind}/{n}": total for n, total in zip(self._names, sums, strict=True)}
-        return metrics
+    def _finished(self, rows: Tensor, diverged: Tensor, ends: dict[str, Tensor]) -> Finished:
+        """Return the episodes that finished in ``rows`` (k,)."""
+        return Finished(
+            reference=self.mdp.reference,
+            recipe=self.mdp.recipe,
+            episodes=Episodes(self._pos[rows], self._quat[rows], self._t[rows]),
+            sums=self._term_sums[:, :, rows],
+            flags=torch.stack((diverged, *ends.values()))[:, rows],
+        )

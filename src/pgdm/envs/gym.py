@@ -66,8 +66,8 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             "object_error_m": float(info["object_error_m"][0]),
             "success": bool(info["success"][0]),
         }
-        if info["episodes"]:
-            out["episode_metrics"] = {k: float(v[0]) for k, v in info["episodes"].items()}
+        if (finished := info["episodes"]) is not None:
+            out["episode_metrics"] = {k: float(v[0]) for k, v in finished.metrics().items()}
         row = obs[0].numpy().copy()
         return row, float(reward[0]), bool(terminated[0]), bool(truncated[0]), out
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pgdm.errors import RunError
 from pgdm.rl.networks import ActorCritic, gaussian_log_prob
-from pgdm.rl.vec_env import VecEnv
+from pgdm.rl.vec_env import Finished, VecEnv
 
 
 @contextmanager
@@ -49,8 +49,8 @@ class Rollout:
     """(T, N) bool, the episode was cut."""
     last_obs: list[tuple[int, Tensor, Tensor]] = field(default_factory=list)
     """Of each step with truncated rows: t, the rows (k,), their true last observations (k, D)."""
-    episodes: dict[str, list[Tensor]] = field(default_factory=dict)
-    """Metrics of the episodes that finished, one tensor (k,) a step."""
+    finished: list[Finished] = field(default_factory=list)
+    """Episodes that finished, one entry a step."""
 
     @classmethod
     def empty(cls, steps: int, env: VecEnv) -> Rollout:
@@ -67,9 +67,12 @@ class Rollout:
 
     def metrics(self) -> dict[str, float]:
         """Return the mean reward of a step, and the means over the finished episodes, if any."""
-        means = {name: float(torch.cat(v).double().mean()) for name, v in self.episodes.items()}
-        finished = sum(len(v) for v in next(iter(self.episodes.values()), []))
-        return {"reward": float(self.reward.mean()), "episodes": float(finished), **means}
+        count = int((self.terminated | self.truncated).sum())
+        metrics = {"reward": float(self.reward.mean()), "episodes": float(count)}
+        if not self.finished:
+            return metrics
+        episodes = self.finished[0].with_later(self.finished[1:]).metrics()
+        return metrics | {name: float(values.double().mean()) for name, values in episodes.items()}
 
 
 class Collector:
@@ -107,7 +110,7 @@ class Collector:
         """
         rollout = self._rollout
         rollout.obs[0] = rollout.obs[-1].clone()
-        rollout.last_obs, rollout.episodes = [], {}
+        rollout.last_obs, rollout.finished = [], []
         with torch_threads(1), torch.no_grad():
             for t in range(self.steps):
                 self._step(rollout, t)
@@ -127,8 +130,8 @@ class Collector:
         if truncated.any():
             rows = truncated.nonzero()[:, 0]
             rollout.last_obs.append((t, rows, info["final_obs"][rows].clone()))
-        for name, values in info["episodes"].items():
-            rollout.episodes.setdefault(name, []).append(values)
+        if info["episodes"] is not None:
+            rollout.finished.append(info["episodes"])
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the next rollout depends on, the policy aside."""

@@ -72,7 +72,8 @@ def run_episodes(
             obs, _, terminated, truncated, info = env.step(action)
             rows = (terminated | truncated).nonzero()[:, 0]
             first = waiting[rows]
-            for name, values in info["episodes"].items():
+            finished = info["episodes"]
+            for name, values in (finished.metrics() if len(rows) else {}).items():
                 column = results.setdefault(name, torch.full((env.num_envs,), torch.nan).double())
                 column[rows[first]] = values[first].double()
             waiting[rows] = False

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol, Self
 
 from torch import Tensor
 
 VecStep = tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]
+
+
+class Finished(Protocol):
+    """Episodes that have ended."""
+
+    def metrics(self) -> dict[str, Tensor]:
+        """Return each metric's values (k,), in the order of the episodes."""
+        ...
+
+    def with_later(self, later: Sequence[Self]) -> Self:
+        """Return these episodes and others as one, in this order."""
+        ...
 
 
 class VecEnv(Protocol):
@@ -34,8 +47,8 @@ class VecEnv(Protocol):
         Returns:
             obs (N, D) float32, of finished rows those after the restart; reward (N,) float32;
             terminated (N,) bool; truncated (N,) bool; info with ``final_obs`` (N, D), the true
-            last observations, ``episodes`` {name: (k,)} of the k rows that finished, in the
-            order of their rows ({} if none), and ``terms`` {name: (N,)} weighted reward terms.
+            last observations, ``episodes``, those that finished (`Finished`) in the order of
+            their rows, or None, and ``terms`` {name: (N,)} weighted reward terms.
         """
         ...
 
