@@ -1,0 +1,124 @@
+"""The paper's comparisons at a hundredth of its length, on the suite quick6; stores runs and page.
+
+    python benchmark/study.py                       run what is missing (hours), then report
+    python benchmark/study.py --settings graff      some of the settings only
+    python benchmark/study.py --collect             report only
+
+Methods, ablations and the start without a pre-grasp, one seed, 0.5M frames, `algo=ppo_fast
+action=residual`; PGDM, the open hand and no pre-grasp also with the paper's actions. Each setting
+is a sweep (`pgdm-run -m`), so that stopping and starting again goes on where it was. What a run
+leaves is stored without checkpoints and films, its training curve thinned, and `pgdm report` makes
+page and tables from that: a run that is stored is not run again, wherever this is started.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from pgdm.config.suites import suite
+from pgdm.tracking.run_folder import CONFIG, RESULT, RunFolder, find_runs
+from pgdm.tracking.run_log import FILE_NAME
+
+RESULTS = Path(__file__).parent / "results" / "study"
+FRAMES = 500_000
+TRAIN_POINTS = 40
+
+TASKS = suite("quick6")
+EXPERTS = [task for task in TASKS if task in suite("adroit_experts")]
+"""Tasks whose hand trajectory of an expert is published: DeepMimic and GRAFF* need one."""
+
+RESIDUAL, ABSOLUTE = "action=residual", "action=absolute"
+COMMON = (
+    "algo=ppo_fast",
+    "seed=0",
+    f"total_frames={FRAMES}",
+    "budget=reduced",
+    "eval.interval_frames=100000",
+    "eval.video=false",
+)
+SETTINGS = {
+    "pgdm": (TASKS, (RESIDUAL,)),
+    "no_pregrasp": (TASKS, (RESIDUAL, "pregrasp=none")),
+    "open_hand": (TASKS, (RESIDUAL, "ablation=open_hand")),
+    "mean_hand": (TASKS, (RESIDUAL, "ablation=mean_hand")),
+    "distance_15cm": (TASKS, (RESIDUAL, "ablation=distance_15cm")),
+    "distance_25cm": (TASKS, (RESIDUAL, "ablation=distance_25cm")),
+    "deepmimic": (EXPERTS, (RESIDUAL, "method=deepmimic")),
+    "graff": (EXPERTS, (RESIDUAL, "method=graff")),
+    "curriculum": (TASKS, (RESIDUAL, "method=curriculum")),
+    "pgdm-absolute": (TASKS, (ABSOLUTE,)),
+    "no_pregrasp-absolute": (TASKS, (ABSOLUTE, "pregrasp=none")),
+    "open_hand-absolute": (TASKS, (ABSOLUTE, "ablation=open_hand")),
+}
+
+
+def place(setting: str, task: str) -> Path:
+    """Return the folder of a stored run."""
+    return RESULTS / "runs" / setting / task
+
+
+def run(setting: str, folder: Path) -> int:
+    """Run the tasks of a setting that are not stored, and store what has finished."""
+    tasks, overrides = SETTINGS[setting]
+    missing = [task for task in tasks if not (place(setting, task) / RESULT).exists()]
+    if not missing:
+        return 0
+    command = [str(Path(sys.executable).with_name("pgdm-run")), "-m", f"task={','.join(missing)}"]
+    command += [*COMMON, *overrides, f"sweep.name={setting}", f"sweep.dir={folder / setting}"]
+    code = subprocess.run(command).returncode
+    for found in find_runs(folder / setting / "runs"):
+        if found.status() == "finished":
+            store(found, place(setting, found.config["task"]["id"]))
+    return code
+
+
+def store(found: RunFolder, target: Path) -> None:
+    """Keep what a report needs of a run."""
+    target.mkdir(parents=True, exist_ok=True)
+    shutil.copy(found.path / CONFIG, target)
+    (target / RESULT).write_text(json.dumps({**found.result, "video": None}, indent=1) + "\n")
+    records = found.log.thinned(TRAIN_POINTS)
+    kept = [
+        {k: v for k, v in record.items() if record["kind"] == "eval" or _of_curve(k)}
+        for record in records
+    ]
+    text = "".join(f"{json.dumps(_without_nan(record))}\n" for record in kept)
+    (target / FILE_NAME).write_text(text)
+
+
+def _of_curve(name: str) -> bool:
+    return "/" not in name or name in ("train/return", "train/success", "train/lifted")
+
+
+def _without_nan(record: dict) -> dict:
+    return {k: None if v != v else v for k, v in record.items()}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run, store, report."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=Path, default=Path("runs/study"))
+    parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=list(SETTINGS))
+    parser.add_argument("--collect", action="store_true", help="run nothing")
+    options = parser.parse_args(arguments)
+    codes = [] if options.collect else [run(s, options.runs) for s in options.settings]
+    stored = len(list((RESULTS / "runs").glob(f"*/*/{RESULT}")))
+    print(f"{stored} of {sum(len(tasks) for tasks, _ in SETTINGS.values())} runs are stored")
+    if stored:
+        pgdm = str(Path(sys.executable).with_name("pgdm"))
+        command = [pgdm, "report", str(RESULTS / "runs"), "--out", str(RESULTS / "report")]
+        codes.append(subprocess.run(command).returncode)
+    if any(codes):
+        raise SystemExit(f"something failed (exit codes {codes}); the same command goes on")
+
+
+if __name__ == "__main__":
+    main()
