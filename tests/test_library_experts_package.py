@@ -139,6 +139,22 @@ def test_contacts_lie_on_the_object_and_stay_there(library: Library) -> None:
     assert np.median(spreads) < 0.004
 
 
+def test_the_documentation_has_these_figures(library: Library) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "assets.md").read_text(encoding="utf-8")
+    for task, e in library.experts().experts.items():
+        contact, close = (
+            " ".join(map(str, e.contact_frames)),
+            [f"{x:.0%}"[:-1] for x in e.within_5mm],
+        )
+        row = (
+            f"| {task} | {e.steps} | {e.skipped} | "
+            f"{1e3 * e.object_mean_m:.2f} / {1e3 * e.object_max_m:.2f} | "
+            f"{e.beyond_limits_rad:.2f} | {e.beyond_limits_m:.2f} | "
+            f"{contact} of {e.touching_frames} | {' '.join(close)} |"
+        )
+        assert row in page
+
+
 def test_filling_again_gives_the_same_bytes_and_a_checkout_alone_is_enough(
     expert_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
