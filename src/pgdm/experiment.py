@@ -140,8 +140,8 @@ class Run(Callback):
         if done and stored.get("status") == "finished":
             self._notify(f"{self.dir} is finished already; its result:")
             return self._stored_result(stored)
-        if self.builder.fallback_note:
-            self._notify(self.builder.fallback_note)
+        for note in self.builder.notes:
+            self._notify(note)
         trainer = self._make_trainer((self, *callbacks), stop)
         if state is not None:
             check_assets(state["metadata"], self.builder, self.dir, self._notify)

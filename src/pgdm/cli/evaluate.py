@@ -57,8 +57,8 @@ def evaluate_policy(request: EvalRequest) -> int:
     library = ensure(cfg.task.motion, request.offline or cfg.offline, notify)
     builder = env_builder(cfg, library)
     check_assets(state.get("metadata", {}), builder, checkpoint, notify)
-    if builder.fallback_note:
-        notify(builder.fallback_note)
+    for note in builder.notes:
+        notify(note)
     with StopRequest() as stop:
         metrics = _measure(cfg, builder, policy, request, checkpoint, stop)
     if metrics is None:

@@ -66,8 +66,11 @@ class Rollout:
         )
 
     def metrics(self) -> dict[str, float]:
-        """Return the mean reward of a step, and the means over the finished episodes, if any."""
-        means = {name: float(torch.cat(v).double().mean()) for name, v in self.episodes.items()}
+        """Return the mean reward of a step, and the means over the finished episodes, if any.
+
+        An episode in which a metric does not apply has NaN, and is left out of its mean.
+        """
+        means = {name: float(torch.cat(v).double().nanmean()) for name, v in self.episodes.items()}
         finished = sum(len(v) for v in next(iter(self.episodes.values()), []))
         return {"reward": float(self.reward.mean()), "episodes": float(finished), **means}
 
