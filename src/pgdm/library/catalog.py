@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from pgdm import paths
 from pgdm.errors import LibraryError, UnknownNameError
+from pgdm.library import expert_file, expert_index, motion_file, staging
 from pgdm.library import manifest as manifests
-from pgdm.library import motion_file, staging
-from pgdm.library.manifest import Manifest, TaskEntry
+from pgdm.library.expert_file import Expert
+from pgdm.library.expert_index import ExpertEntry, ExpertIndex
+from pgdm.library.manifest import FileEntry, Manifest, TaskEntry
 from pgdm.library.motion_file import Motion
 
 CURE = "Fill the library with 'pgdm assets fetch' or 'pgdm assets import PATH' (a TCDM checkout)."
 """What to do when the library lacks something."""
+
+EXPERT_CURE = "Get the expert hand trajectories with 'pgdm assets fetch'."
+"""What to do when there are none."""
 
 
 class Library:
@@ -84,6 +89,60 @@ class Library:
         """Return the file of a task's motion."""
         source = self._source(motion_id, source)
         return self._existing(source, f"motions/{motion_id}.npz")
+
+    def experts(self) -> ExpertIndex:
+        """Return which tasks have an expert hand trajectory, with provenance and quality.
+
+        Raises:
+            CorruptAssetError: their index is damaged.
+        """
+        folder = staging.folder_of(self.root, staging.EXPERTS)
+        return ExpertIndex("", {}, {}) if folder is None else expert_index.read(folder)
+
+    def expert_entry(self, task: str) -> ExpertEntry:
+        """Return provenance and quality of a task's expert hand trajectory.
+
+        Raises:
+            UnknownNameError: the task has none; names those that have one.
+        """
+        index = self.experts()
+        if task not in index.experts:
+            hint = "Only motion-capture tasks have one." if index.experts else EXPERT_CURE
+            if task in index.left_out:
+                hint = f"Left out: {index.left_out[task]}."
+            raise UnknownNameError("expert hand trajectory", task, index.experts, hint)
+        return index.experts[task]
+
+    def expert(self, task: str) -> Expert:
+        """Read a task's expert hand trajectory.
+
+        Raises:
+            UnknownNameError: the task has none; names those that have one.
+            CorruptAssetError: its file is damaged.
+            LibraryError: it was made for a motion of another length.
+        """
+        self.expert_entry(task)
+        folder = staging.folder_of(self.root, staging.EXPERTS)
+        assert folder is not None
+        expert = expert_file.read(folder / f"{task}.npz", task)
+        steps = self.entry(task).steps
+        if len(expert.qpos) != steps:
+            raise LibraryError(
+                f"the expert hand trajectory of '{task}' has {len(expert.qpos)} poses, its motion "
+                f"{steps}: they come from different data. {EXPERT_CURE}"
+            )
+        return expert
+
+    def files(self) -> Iterator[tuple[str, Path, FileEntry]]:
+        """Yield every file that the manifests list: its name for messages, path and entry."""
+        for source, manifest in self._sources.items():
+            for name, entry in manifest.files.items():
+                yield f"{source}/{name}", self._folders[source] / name, entry
+        folder = staging.folder_of(self.root, staging.EXPERTS)
+        if folder is not None:
+            for task, expert in self.experts().experts.items():
+                name = f"{task}.npz"
+                yield f"{staging.EXPERTS}/{name}", folder / name, expert.file
 
     def hand_xml(self, hand: str, source: str | None = None) -> Path:
         """Return the MJCF file of a hand with its actuators.

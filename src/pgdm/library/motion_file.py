@@ -70,13 +70,7 @@ def check(
     if steps < 2:
         raise CorruptAssetError(f"{label}: object_translation has {steps} rows, needs 2 or more")
     orientation = numbers(arrays, "object_orientation", label, (steps, 4))
-    norms = np.linalg.norm(orientation, axis=1)
-    worst = int(np.abs(norms - 1.0).argmax())
-    if abs(norms[worst] - 1.0) > _UNIT_TOLERANCE:
-        raise CorruptAssetError(
-            f"{label}: object_orientation row {worst} has norm {norms[worst]:.4g}, "
-            "not a unit quaternion"
-        )
+    check_unit(orientation, "object_orientation", label)
     substeps = float(numbers(arrays, "substeps", label, ()))
     if not 1 <= substeps <= 1000 or substeps != int(substeps):
         raise CorruptAssetError(f"{label}: substeps is {substeps}, not a whole number from 1")
@@ -85,6 +79,20 @@ def check(
         if f"start_{name}_qpos" in arrays:
             starts[name] = _start(arrays, name, label)
     return translation, orientation, int(substeps), starts
+
+
+def check_unit(quaternions: np.ndarray, key: str, label: str) -> None:
+    """Check that quaternions (T, 4) are unit.
+
+    Raises:
+        CorruptAssetError: one is not; names its row.
+    """
+    norms = np.linalg.norm(quaternions, axis=1)
+    worst = int(np.abs(norms - 1.0).argmax())
+    if abs(norms[worst] - 1.0) > _UNIT_TOLERANCE:
+        raise CorruptAssetError(
+            f"{label}: {key} row {worst} has norm {norms[worst]:.4g}, not a unit quaternion"
+        )
 
 
 def _start(arrays: Mapping[str, Any], name: str, label: str) -> Start:

