@@ -49,7 +49,7 @@ from pgdm.methods import METHODS
         (["method=curriculum", "method.curriculum.ramp_frames=0"], "ramp_frames is 0; it must be"),
         (["method=deepmimic", "method.imitation=null"], "method.imitation: null is not allowed"),
         (["method.name=graff"], r"missing method.contact; give a value"),
-        (["method=graff", "method.contact.weigth=1"], "weigth'; did you mean method.contact.weight"),
+        (["method=graff", "method.contact.weigth=1"], "did you mean method.contact.weight"),
         (["method.name=no_such_module:METHOD"], "cannot import 'no_such_module'.*PYTHONPATH"),
         (["method.name='json:dumps'"], "'dumps' of .* is not a pgdm.methods.Method; it has: none"),
         (["method.name='pgdm.methods.method:'"], "not of the form my_package.module:attribute"),

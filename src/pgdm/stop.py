@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Callable
 from types import FrameType, TracebackType
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
@@ -64,3 +65,19 @@ class StopRequest:
         again = "" if self._patient else " (again: stop at once)"
         sys.stderr.write(f"\n{how}: saving and stopping at the next safe point{again}\n")
         sys.stderr.flush()
+
+
+def stoppable(
+    stop: Callable[[], bool], inner: Callable[[str, int, int], None]
+) -> Callable[[str, int, int], None]:
+    """Return a progress listener that lets what it listens to end at a stop request.
+
+    What was downloaded by then stays for the next time.
+    """
+
+    def progress(step: str, done: int, total: int) -> None:
+        if stop():
+            raise KeyboardInterrupt
+        inner(step, done, total)
+
+    return progress
