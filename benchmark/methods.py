@@ -138,9 +138,9 @@ def plot(found: Sequence[dict[str, Any]], tasks: Sequence[str], path: Path) -> N
             axis.set_ylim(bottom=0)
     handles = {h.get_label(): h for a in axes.flat for h in a.get_lines()}
     if handles:
-        figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=len(handles))
+        figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=3)
     figure.suptitle("One seed, ppo_fast, residual actions")
-    figure.tight_layout(rect=(0, 0.04, 1, 1))
+    figure.tight_layout(rect=(0, 0.06, 1, 1))
     figure.savefig(path, dpi=80)
 
 
