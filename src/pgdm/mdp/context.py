@@ -86,9 +86,16 @@ class StepContext:
         slides are in m and the hinges in rad. ``squared`` is the square of the difference's
         length, ``norm`` the length itself.
         """
-        offset = self.fingertip_offset if space == "fingertips" else self.joint_offset
-        squared = offset.flatten(1).square().sum(1)
+        squared = self._squared_fingertips if space == "fingertips" else self._squared_joints
         return squared if form == "squared" else squared.sqrt()
+
+    @cached_property
+    def _squared_fingertips(self) -> Tensor:
+        return self.fingertip_offset.square().sum((1, 2))
+
+    @cached_property
+    def _squared_joints(self) -> Tensor:
+        return self.joint_offset.square().sum(1)
 
     @property
     def _expert(self) -> ExpertReference:
