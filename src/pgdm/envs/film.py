@@ -1,8 +1,8 @@
-"""Films: a policy at work, and an exemplar motion by itself."""
+"""Films: a policy at work, an exemplar motion by itself, and with the expert's hand."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from pgdm.sim.render import Renderer, write_video
 from pgdm.sim.replay import motion_qpos
 from pgdm.sim.scene import Scene
 
+_CLOSE_M = 0.4  # height of the picture around the object where contacts are to be seen
 LAST_FRAME_REPEATS = 12  # half a second to see how it ended
 
 Act = Callable[[Tensor], Tensor]
@@ -78,5 +79,34 @@ def film_motion(env: BatchEnv, path: Path) -> Path:
         return write_video(path, frames, round(1 / env.sim.control_dt_s))
 
 
-def _renderer(scene: Scene, reference: ObjectReference) -> Renderer:
-    return Renderer(scene.model, scene.index.object_body, motion=reference.pos.numpy())
+def film_expert(
+    scene: Scene,
+    qpos: np.ndarray,
+    marks: Sequence[np.ndarray],
+    reference: ObjectReference,
+    path: Path,
+) -> Path:
+    """Write an MP4 of hand and object moving as the expert's did; return its poster.
+
+    Args:
+        scene: the task's.
+        qpos: joint positions (T, nq) at the control steps.
+        marks: where fingers touch the object at each of them, (n, 3) m each, world frame.
+        reference: the object's motion, which the picture shows.
+        path: of the MP4.
+
+    Raises:
+        RenderError: if no OpenGL works here or the file cannot be written.
+    """
+    last = len(qpos) - 1
+    with _renderer(scene, reference, _CLOSE_M) as renderer:
+        frames = (
+            renderer.render_qpos(row, None, f"{scene.task.id}  expert hand  {t}/{last}", marks[t])
+            for t, row in enumerate(qpos)
+        )
+        return write_video(path, frames)
+
+
+def _renderer(scene: Scene, reference: ObjectReference, follow_m: float | None = None) -> Renderer:
+    motion = reference.pos.numpy()
+    return Renderer(scene.model, scene.index.object_body, motion=motion, follow_m=follow_m)

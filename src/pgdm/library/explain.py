@@ -6,9 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pgdm.library.catalog import Library
+from pgdm.library import figures
+from pgdm.library.catalog import EXPERT_CURE, Library
 from pgdm.library.check import compiled
 from pgdm.library.compare import Difference, compare, compare_options
+from pgdm.library.expert_file import FINGERS
 
 _MOTION_TOLERANCE = 1e-9
 """Poses and joint positions that differ by less (m, rad) count as equal."""
@@ -38,11 +40,47 @@ def explain(library: Library, task: str) -> Iterator[str]:
         hand = f"/{entry.hand}/"
         yield from (f"  defect: {d}" for d in manifest.defects if hand in d or task in d)
         yield from (f"  note: {note}" for note in manifest.notes.get(task, []))
+    yield from explain_expert(library, task)
     if len(having) < 2:
         return
     yield f"\ndifferences between {having[0]} and {having[1]}:"
     found = list(differences(library, task, having[0], having[1]))
     yield from (f"  {line}" for line in found or ["none"])
+
+
+def explain_expert(library: Library, task: str) -> Iterator[str]:
+    """Yield lines about a task's expert hand trajectory: provenance, licence, quality.
+
+    Raises:
+        CorruptAssetError: the index of the expert trajectories is damaged.
+    """
+    index = library.experts()
+    if task not in index.experts:
+        if task in index.left_out:
+            yield f"\nexpert hand trajectory: none, {index.left_out[task]}"
+        elif task in figures.GRAB_TASKS:
+            yield f"\nexpert hand trajectory: not fetched yet. {EXPERT_CURE}"
+        else:
+            yield "\nexpert hand trajectory: none, the task is not from motion capture"
+        return
+    entry, file = index.experts[task], index.experts[task].file
+    kind = "rebuilt, approximate" if entry.approximate else "published"
+    yield f"\nexpert hand trajectory ({kind}): {entry.package}, {index.made_at}"
+    yield f"  experts/{task}.npz  sha256 {file.sha256[:16]}  {file.licence}  from {file.origin}"
+    yield f"  poses: {entry.steps}, after {entry.skipped} frames of the recording"
+    moved = ", ".join(f"{1e3 * x:.1f}" for x in entry.shift_m)
+    yield (
+        f"  its object lies off the motion's by {1e3 * entry.object_mean_m:.3f} mm (mean), "
+        f"{1e3 * entry.object_max_m:.3f} mm (most)"
+        + (f", after a shift by ({moved}) mm" if any(entry.shift_m) else "")
+    )
+    yield (
+        f"  leaves the joints' limits by up to {entry.beyond_limits_rad:.2f} rad and, at the base, "
+        f"{entry.beyond_limits_m:.2f} m (clipped for methods)"
+    )
+    yield f"  the hand touches the object at {entry.touching_frames} poses; of these, by finger:"
+    rows = zip(FINGERS, entry.contact_frames, entry.within_5mm, strict=True)
+    yield "  " + "; ".join(f"{name} in contact {n}, within 5 mm {p:.0%}" for name, n, p in rows)
 
 
 def needed(library: Library, task: str, source: str) -> list[str]:

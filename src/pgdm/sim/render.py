@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import weakref
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -16,9 +17,11 @@ from pgdm.errors import RenderError
 from pgdm.paths import replacing
 from pgdm.sim.camera import camera_for
 from pgdm.sim.gl import context_class
+from pgdm.sim.marks import add_marks
 
 MAX_GEOMS = 2000
 GHOST_RGBA = np.array([0.15, 0.95, 0.45, 0.35], np.float32)
+HAND_ALPHA = 0.25  # of a hand that must not hide what it touches
 # Software OpenGL: a frame of 640x480 costs about 75 ms with these, 230 ms with the scene's own.
 SHADOW_SIZE = 1024
 SAMPLES = 4
@@ -36,6 +39,8 @@ class Renderer:
         height: of the pictures, pixels.
         motion: positions of the object's centre of mass that the picture should show, (T, 3) m,
             usually the task's exemplar motion; None shows the middle of the table.
+        follow_m: how much of the world the height shows where the camera follows the object from
+            near; None shows all of the motion from where it stands.
 
     Raises:
         RenderError: if no OpenGL works here.
@@ -48,11 +53,16 @@ class Renderer:
         width: int = 640,
         height: int = 480,
         motion: np.ndarray | None = None,
+        follow_m: float | None = None,
     ) -> None:
         self.model, self.width, self.height = model, width, height
         self._object_body = object_body
         self._com = model.body_ipos[object_body].copy()  # (3,) m, of the COM in the body's frame
         attached = model.body_weldid == model.body_weldid[object_body]
+        moves = model.body_weldid != 0
+        self._hand_geoms = frozenset(
+            np.flatnonzero((moves & ~attached)[model.geom_bodyid]).tolist()
+        )
         self._ghost_geoms = frozenset(np.flatnonzero(attached[model.geom_bodyid]).tolist())
         self._data = mujoco.MjData(model)
         self._scene = mujoco.MjvScene(model, MAX_GEOMS)
@@ -60,6 +70,10 @@ class Renderer:
         self._option = mujoco.MjvOption()
         mujoco.mj_kinematics(model, self._data)
         self._camera = camera_for(model, self._data, object_body, motion, width / height)
+        self._follows = follow_m is not None
+        if follow_m is not None:
+            half_angle = math.radians(model.vis.global_.fovy) / 2
+            self._camera.distance = follow_m / 2 / math.tan(half_angle)
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._gl, self._mjr = _open(model, width, height)
         self._free = weakref.finalize(self, _close, self._gl, self._mjr)
@@ -69,6 +83,7 @@ class Renderer:
         data: mujoco.MjData,
         goal: tuple[np.ndarray, np.ndarray] | None = None,
         caption: str = "",
+        marks: np.ndarray | None = None,
     ) -> np.ndarray:
         """Draw a state.
 
@@ -77,6 +92,8 @@ class Renderer:
             goal: where the object should be: its centre of mass (3,) m and its orientation (4,)
                 wxyz, world frame; None draws no ghost.
             caption: text in the upper left corner.
+            marks: points (n, 3) m, world frame, to show as small spheres, through a hand that is
+                translucent then.
 
         Returns:
             The picture, (height, width, 3) uint8.
@@ -87,6 +104,8 @@ class Renderer:
         if not self._free.alive:
             raise RenderError("this renderer is closed")
         self._gl.make_current()
+        if self._follows:
+            self._camera.lookat[:] = data.xipos[self._object_body]
         every = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(
             self.model, data, self._option, None, self._camera, every, self._scene
@@ -95,6 +114,9 @@ class Renderer:
             light.castshadow = False  # each shadow costs one more pass over the scene
         if goal is not None:
             self._add_ghost(data, *goal)
+        if marks is not None:
+            self._fade_hand()
+            add_marks(self._scene, marks)
         mujoco.mjr_render(self._rect, self._scene, self._mjr)
         if caption:
             font, corner = mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT
@@ -108,13 +130,14 @@ class Renderer:
         qpos: np.ndarray,
         goal: tuple[np.ndarray, np.ndarray] | None = None,
         caption: str = "",
+        marks: np.ndarray | None = None,
     ) -> np.ndarray:
         """Draw joint positions qpos (nq,); otherwise as ``render``."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self._data)
         mujoco.mj_comPos(self.model, self._data)
         mujoco.mj_camlight(self.model, self._data)
-        return self.render(self._data, goal, caption)
+        return self.render(self._data, goal, caption, marks)
 
     def close(self) -> None:
         """Give back what OpenGL holds; harmless when called twice."""
@@ -132,6 +155,11 @@ class Renderer:
     ) -> None:
         """Close."""
         self.close()
+
+    def _fade_hand(self) -> None:
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in self._hand_geoms:
+                geom.rgba[3] = min(geom.rgba[3], HAND_ALPHA)
 
     def _add_ghost(self, data: mujoco.MjData, com: np.ndarray, quat: np.ndarray) -> None:
         """Add the object's visible geoms once more, moved from where it is to the goal."""

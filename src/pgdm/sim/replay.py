@@ -1,4 +1,4 @@
-"""The exemplar motion as joint positions, to look at or to start from."""
+"""The exemplar motion and the expert's as joint positions, to look at or to start from."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from pgdm import rotations
-from pgdm.motion.reference import ObjectReference
+from pgdm.motion.reference import ExpertReference, ObjectReference
 from pgdm.sim.scene import Scene
 
 
@@ -33,3 +33,25 @@ def motion_qpos(scene: Scene, start: np.ndarray, reference: ObjectReference) -> 
     qpos[:, at : at + 3] = rotations.rotate(to_home, origin - home_pos).numpy()
     qpos[:, at + 3 : at + 6] = rotations.unwrap(rotations.to_euler_xyz(turn)).numpy()
     return qpos
+
+
+def expert_qpos(
+    scene: Scene, start: np.ndarray, reference: ObjectReference, joints: np.ndarray
+) -> np.ndarray:
+    """Return qpos (T, nq) at which hand and object move as the expert's did.
+
+    Args:
+        scene: the task's.
+        start: joint positions (nq,) of whatever else is in the scene.
+        reference: the object's motion, its positions those of the centre of mass.
+        joints: the hand's (T, nu), m and rad.
+    """
+    qpos = motion_qpos(scene, start, reference)
+    qpos[:, : scene.index.num_actuators] = joints  # the hand's joints come first
+    return qpos
+
+
+def expert_marks(reference: ObjectReference, expert: ExpertReference) -> list[np.ndarray]:
+    """Return where fingers touch the object at each of T poses, (n, 3) m each, world frame."""
+    points = expert.contact_points(torch.arange(len(expert)), reference.pos, reference.quat)
+    return [points[t][expert.in_contact[t]].numpy() for t in range(len(expert))]
