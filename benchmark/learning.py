@@ -12,18 +12,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+from short_runs import Job, curves, finished, train_all
 
 from pgdm.config.saved import load_config
 from pgdm.config.suites import suite
-from pgdm.tracking.run_folder import read_json
-from pgdm.tracking.run_log import RunLog
 
 RESULTS = Path(__file__).parent / "results" / "learning"
 FRAMES = 1_000_000
@@ -42,40 +38,23 @@ COMMON = (
 CURVES = ("success", "lifted", "return", "com_error")
 
 
-def train(folder: Path, task: str, setting: str) -> int:
-    """Train one run to its end, or go on with it; return the exit code."""
-    name = f"{task}-{setting}"
-    command = [str(Path(sys.executable).with_name("pgdm-run")), f"task={task}", *COMMON]
-    command += [*SETTINGS[setting], f"run_dir={folder / name}", "num_threads=1", "tracking=none"]
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / f"{name}.log", "a") as log:
-        return subprocess.run(command, stdout=log, stderr=log).returncode
-
-
-def collect(run: Path, task: str, setting: str) -> dict[str, Any] | None:
+def collect(run: Path, job: Job) -> dict[str, Any] | None:
     """Return what a finished run reached and how, or None if it has not finished."""
-    result = read_json(run / "result.json")
-    if result.get("status") != "finished":
+    result = finished(run)
+    if result is None:
         return None
     cfg = load_config(run)
-    lines = RunLog(run / "metrics.jsonl").read()
-    evals = [line for line in lines if line["kind"] == "eval"]
-    curve = {
-        f"{kind}/{name}": [
-            round(float(line.get(f"{kind}/{name}", float("nan"))), 5) for line in evals
-        ]
-        for kind in ("eval_sampled", "eval_deterministic")
-        for name in CURVES
-    }
+    kinds = ("eval_sampled", "eval_deterministic")
+    curve = curves(run, "eval", [f"{kind}/{name}" for kind in kinds for name in CURVES])
     return {
-        "task": task,
-        "setting": setting,
-        "overrides": [*COMMON, *SETTINGS[setting]],
+        "task": job.task,
+        "setting": job.setting,
+        "overrides": list(job.overrides),
         "paper_success": cfg.task.paper_success,
         "paper_com_error": cfg.task.paper_com_error,
-        "curve_frames": [line["frames"] for line in evals],
+        "curve_frames": curve.pop("frames"),
         "curves": curve,
-        **{k: v for k, v in result.items() if k != "video"},
+        **result,
     }
 
 
@@ -129,19 +108,19 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs/learning"))
     parser.add_argument("--collect", action="store_true", help="do not train")
     options = parser.parse_args()
-    jobs = [(task, setting) for setting in SETTINGS for task in QUICK6]
+    jobs = [
+        Job(task, setting, (*COMMON, *overrides))
+        for setting, overrides in SETTINGS.items()
+        for task in QUICK6
+    ]
     if not options.collect:
-        with ThreadPoolExecutor(2) as pool:
-            codes = list(pool.map(lambda job: train(options.runs, *job), jobs))
-        if any(codes):
-            failed = [f"{t}-{s}" for (t, s), code in zip(jobs, codes, strict=True) if code]
-            raise SystemExit(f"failed: {', '.join(failed)}; see the logs in {options.runs}")
+        train_all(options.runs, jobs)
     RESULTS.mkdir(parents=True, exist_ok=True)
-    for task, setting in jobs:
-        one = collect(options.runs / f"{task}-{setting}", task, setting)
+    for job in jobs:
+        one = collect(options.runs / job.name, job)
         if one is not None:
-            (RESULTS / f"{task}-{setting}.json").write_text(json.dumps(one, indent=1) + "\n")
-    stored = [RESULTS / f"{task}-{setting}.json" for task, setting in jobs]
+            (RESULTS / f"{job.name}.json").write_text(json.dumps(one, indent=1) + "\n")
+    stored = [RESULTS / f"{job.name}.json" for job in jobs]
     found = [json.loads(file.read_text()) for file in stored if file.exists()]
     (RESULTS / "README.md").write_text(
         f"# {len(found)} of {len(jobs)} runs\n\n`python benchmark/learning.py`\n\n{table(found)}"

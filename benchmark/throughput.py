@@ -1,6 +1,6 @@
 """Speed of pgdm: stepping, training, start and memory. Prints one table, medians of five.
 
-    python benchmark/throughput.py [--task hammer-use1] [--rounds 5] [--write]
+    python benchmark/throughput.py [--task hammer-use1] [--rounds 5] [--write] [--methods-only]
 
 Beside everything runs bare ``mujoco.batch.Batch`` doing the very same steps (targets, gravity
 compensation, restarts, from the same states) with nothing around it: step by step beside the batch
@@ -27,6 +27,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
+from method_cost import measure_methods
 from mujoco import batch as mujoco_batch
 from rich.console import Console
 from rich.table import Table
@@ -285,14 +286,18 @@ def main() -> None:
     parser.add_argument("--task", default="hammer-use1")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--write", action="store_true", help=f"store the figures in {RESULT.name}")
+    parser.add_argument("--methods-only", action="store_true", help="only the methods' rows")
     options = parser.parse_args()
+    if options.write and options.methods_only:
+        parser.error("--write stores all figures; leave --methods-only out")
     console = Console()
-    figures = measure(options.task, options.rounds, console)
+    figures = {} if options.methods_only else measure(options.task, options.rounds, console)
+    figures |= measure_methods(options.task, NUM_ENVS, options.rounds, console)
     table = Table(title=f"{options.task}, N=64, {os.cpu_count()} cores")
     for name in ("figure", "median", "min", "max"):
         table.add_column(name, justify="left" if name == "figure" else "right")
     for name, values in figures.items():
-        digits = 2 if "/ bare" in name or "s)" in name else 0
+        digits = 2 if "/ bare" in name or "/ pgdm" in name or "s)" in name else 0
         row = (statistics.median(values), min(values), max(values))
         table.add_row(name, *(f"{value:,.{digits}f}" for value in row))
     console.print(table)

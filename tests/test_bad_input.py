@@ -98,7 +98,7 @@ def assert_helps(outcome: Outcome, *said: str, code: int | None = None) -> None:
         (["sweep=validate_tcdm50"], ["with a plus: +sweep=validate_tcdm50"]),
         (["+sweep=sim2real", "+sweep=sim2real"], ["+sweep is there 2 times"]),
         (["+sweep=sim2real", "budget=smok"], ["unknown budget 'smok'; did you mean smoke"]),
-        (["--dry-run"], ["'--dry-run' is for sweeps; add -m"]),
+        (["sweep.dry_run=true"], ["'sweep.dry_run=true' is for sweeps; add -m"]),
         (["sweep.name=x"], ["'sweep.name=x' is for sweeps; add -m"]),
         (["hydra.launcher.max_jobs=2"], ["is for sweeps; add -m"]),
     ],

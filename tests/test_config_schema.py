@@ -13,6 +13,7 @@ from pgdm.config.groups import available, conf_dir, groups
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.store import compose
 from pgdm.errors import ConfigError
+from pgdm.methods import METHODS
 
 
 @pytest.mark.parametrize(
@@ -38,6 +39,20 @@ from pgdm.errors import ConfigError
         (["pregrasp.source=mimed"], "unknown pregrasp.source value 'mimed'; did you mean mined"),
         (["tracking.kind=wandb"], "unknown tracking.kind value 'wandb'"),
         (["method.name=pgmd"], "unknown method.name value 'pgmd'; did you mean pgdm"),
+        (["method.reward.tracking_scale=0"], "method.reward.tracking_scale is 0.0; it must be ab"),
+        (["method=deepmimic", "method.imitation.space=joint"], "'joint'; did you mean joints"),
+        (["method=deepmimic", "method.imitation.form=square"], "did you mean squared"),
+        (["method=deepmimic", "method.imitation.scale=0"], "method.imitation.scale is 0.0; it mu"),
+        (["method=deepmimic", "method.imitation.grace_steps=-1"], "grace_steps is -1; .* least 0"),
+        (["method=full", "method.imitation.max_hand_error=0"], "max_hand_error is 0.0"),
+        (["method=graff", "method.contact.form=l2"], "unknown method.contact.form value 'l2'"),
+        (["method=curriculum", "method.curriculum.ramp_frames=0"], "ramp_frames is 0; it must be"),
+        (["method=deepmimic", "method.imitation=null"], "method.imitation: null is not allowed"),
+        (["method.name=graff"], r"missing method.contact; give a value"),
+        (["method=graff", "method.contact.weigth=1"], "did you mean method.contact.weight"),
+        (["method.name=no_such_module:METHOD"], "cannot import 'no_such_module'.*PYTHONPATH"),
+        (["method.name='json:dumps'"], "'dumps' of .* is not a pgdm.methods.Method; it has: none"),
+        (["method.name='pgdm.methods.method:'"], "not of the form my_package.module:attribute"),
         (["run_dir=''"], "run_dir is empty"),
         (["task.objects=[]"], "task.objects is empty"),
         (["task.placements=[{body: a, pos_m: [1], quat: null}]"], "pos_m has 1 numbers, not 3"),
@@ -66,11 +81,19 @@ def fields(cls: type, path: str = "") -> dict[str, type]:
     found: dict[str, type] = {}
     for name, hint in typing.get_type_hints(cls).items():
         key = f"{path}.{name}" if path else name
-        inner = typing.get_args(hint)[0] if typing.get_origin(hint) is list else hint
+        inner = hint if typing.get_origin(hint) is None else typing.get_args(hint)[0]
         if dataclasses.is_dataclass(inner):
             found |= fields(typing.cast(type, inner), key)
         else:
             found[key] = cls
+    return found
+
+
+def all_fields() -> dict[str, type]:
+    """Return all keys, those of every method included."""
+    found = fields(ExperimentCfg)
+    for method in METHODS.values():
+        found |= fields(method.config, "method")
     return found
 
 
@@ -88,13 +111,13 @@ def test_every_key_is_read_somewhere() -> None:
                 read.add(node.value)
                 read.add(node.value.rpartition(".")[2])
     # Only a name so far: nothing is taken away before the ablations are there.
-    unread = [key for key in fields(ExperimentCfg) if key.rpartition(".")[2] not in read]
+    unread = [key for key in all_fields() if key.rpartition(".")[2] not in read]
     assert unread == []
 
 
 def test_every_field_says_what_it_means() -> None:
     undocumented = []
-    for cls in {*fields(ExperimentCfg).values(), ExperimentCfg}:
+    for cls in {*all_fields().values(), ExperimentCfg}:
         module = Path(__import__("sys").modules[cls.__module__].__file__ or "")
         tree = ast.parse(module.read_text())
         node = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == cls.__name__)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,14 +11,16 @@ from pathlib import Path
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from command_line import TINY, process
 from pgdm.config.store import compose
 from pgdm.config.suites import expand_tasks
 from pgdm.sweep.expand import grid
 from pgdm.sweep.studies import open_study
+from pgdm.tracking.run_log import RunLog
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
-PAGES = sorted(DOCS.glob("*.md"))
+PAGES = sorted(DOCS.rglob("*.md"))
 
 sys.path.insert(0, str(REPOSITORY / "tools"))
 import configuration_page  # noqa: E402 (tools/ is no package: nothing in src may import it)
@@ -37,8 +38,8 @@ def test_every_setting_is_explained() -> None:
 
 def test_every_page_is_in_the_navigation() -> None:
     text = (REPOSITORY / "mkdocs.yml").read_text(encoding="utf-8")
-    nav = set(re.findall(r"^  - [^:]+: (\S+\.md)$", text, re.MULTILINE))
-    assert nav == {page.name for page in PAGES}
+    nav = set(re.findall(r"^ +- [^:]+: (\S+\.md)$", text, re.MULTILINE))
+    assert nav == {str(page.relative_to(DOCS)) for page in PAGES}
 
 
 def test_the_site_builds_strictly(tmp_path: Path) -> None:
@@ -79,13 +80,13 @@ def test_settings_in_commands_exist(command: str) -> None:
     compose(typed)
 
 
-def _follow(heading: str, folder: Path) -> None:
-    """Write the files that a section of docs/extending.md has its reader write."""
-    text = (DOCS / "extending.md").read_text(encoding="utf-8")
+def _follow(heading: str, folder: Path, page: str = "extending.md") -> None:
+    """Write the files that a section of a page has its reader write."""
+    text = (DOCS / page).read_text(encoding="utf-8")
     section = text.split(f"\n## {heading}\n")[1].split("\n## ")[0]
     step = r"Write `([^`]+)`[^`]*?(?:`[^`]+`[^`]*?)*:\n\n    ```\w+\n(.*?)    ```"
     files = re.findall(step, section, re.DOTALL)
-    assert files, f"docs/extending.md writes no file under '{heading}'"
+    assert files, f"docs/{page} writes no file under '{heading}'"
     for name, body in files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(re.sub(r"(?m)^    ", "", body), encoding="utf-8")
@@ -126,27 +127,17 @@ def test_recipe_for_a_hand(tmp_path: Path, library_home: Path) -> None:
 
 
 def test_recipe_for_a_method(tmp_path: Path, library_home: Path) -> None:
-    for part in ("src", "conf"):
-        shutil.copytree(REPOSITORY / part, tmp_path / part)
-    _follow("A method", tmp_path)
-    registry = tmp_path / "src" / "pgdm" / "methods" / "__init__.py"
-    text = registry.read_text(encoding="utf-8")
-    text = text.replace("import pgdm\n", "import near, pgdm\n", 1)
-    text = text.replace(
-        '    "pgdm": pgdm.recipe,\n', '    "pgdm": pgdm.recipe,\n    "near": near.recipe,\n'
-    )
-    registry.write_text(text, encoding="utf-8")
-    program = (
-        "import pgdm, torch\n"
-        "env = pgdm.make_batch('cup-pour1', num_envs=2, num_threads=1, method='near')\n"
-        "info = env.step(torch.zeros(2, env.action_dim))[4]\n"
-        "print(pgdm.__file__, info['terms']['near'].tolist())\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        env=os.environ | {"PYTHONPATH": str(tmp_path / "src")},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.stdout == f"{tmp_path / 'src' / 'pgdm' / '__init__.py'} [1.0, 1.0]\n", done.stderr
+    _follow("Steps", tmp_path, "methods/your-own.md")
+    page = (DOCS / "methods" / "your-own.md").read_text(encoding="utf-8")
+    looked, ran = re.findall(r"^    pgdm-run (.*)$", page, re.MULTILINE)
+    place = {"PYTHONPATH": os.pathsep.join([str(REPOSITORY / "src"), "my"])}
+    shown = process("pgdm-run", *looked.split(), env=place)
+    assert re.search(r"reward +near +1 ", shown.out), shown.err
+    done = process("pgdm-run", *ran.split(), *TINY, "--offline", "run_dir=run", env=place)
+    assert done.code == 0, done.err
+    line = RunLog(tmp_path / "run" / "metrics.jsonl").read()[-1]
+    # The cup is within 3 cm of its target in each of the first steps.
+    assert line["eval_deterministic/raw/near"] >= 1
+    assert line["eval_deterministic/term/near"] == line["eval_deterministic/raw/near"]
+    failed = process("pgdm-run", *looked.split(), env={"PYTHONPATH": str(REPOSITORY / "src")})
+    assert failed.code == 2 and "cannot import 'near_method'" in failed.err

@@ -50,6 +50,7 @@ def context(pos: list, quat: list, target: list, target_quat: list, t: int = 1) 
         double(target),
         double(target_quat),
         double([0.1] * n),
+        tiny_index(),
     )
 
 

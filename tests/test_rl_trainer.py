@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pgdm.errors import CheckpointError, ConfigError, RunError
+from pgdm.mdp.schedules import Ramp
 from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.rl.evaluate import Evaluator, load_policy
@@ -159,6 +160,39 @@ def test_schedules_are_applied_before_each_iteration() -> None:
     Trainer(env, trainer_cfg(total_frames=1024), Extras(schedules=[ramp])).run()
     assert seen == [0, 256, 512, 768]
     assert env.weights["near"] == 0.75
+
+
+def test_scheduled_weights_are_recorded_and_survive_a_resume_and_another_width(
+    tmp_path: Path,
+) -> None:
+    ramp = Ramp("near", 2.0, 1024)
+
+    def weights(record: Record) -> list[tuple[int, float]]:
+        told = record.named("iteration")
+        return [(frames, metrics["train/weight/near"]) for _, frames, metrics in told]
+
+    cfg = trainer_cfg(total_frames=1536)
+    straight, first, second, wide = Record(), Record(), Record(), Record()
+    Trainer(PointEnv(), cfg, Extras(schedules=[ramp], callbacks=[straight])).run()
+    # Frames at an iteration's end; its weight is that of its start.
+    expected = [(256, 0.0), (512, 0.5), (768, 1.0), (1024, 1.5), (1280, 2.0), (1536, 2.0)]
+    assert weights(straight) == expected
+
+    folder = CheckpointFolder(tmp_path, 2)
+    stopping = replace(stop_after(first, 2), schedules=[ramp], checkpoints=folder)
+    Trainer(PointEnv(), cfg, stopping).run()
+    env = PointEnv()
+    trainer = Trainer(env, cfg, Extras(schedules=[ramp], callbacks=[second]))
+    state = folder.latest()
+    assert state is not None
+    trainer.load_state_dict(state)
+    trainer.run()
+    assert weights(first) + weights(second) == expected
+    assert env.weights["near"] == 2.0
+
+    # Twice the simulations: half the iterations, and the same line over frames.
+    Trainer(PointEnv(16), cfg, Extras(schedules=[ramp], callbacks=[wide])).run()
+    assert weights(wide) == [(512, 0.0), (1024, 1.0), (1536, 2.0)]
 
 
 def stop_after(record: Record, iterations: int) -> Extras:

@@ -7,6 +7,7 @@ tests/test_docs.py fails if the page is not what this would write.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import yaml
@@ -85,9 +86,16 @@ def _sweeps() -> list[str]:
     return lines
 
 
+def _whole(file: Path) -> Description:
+    """Return what a file says, with the keys of the parts that it is put together from."""
+    own = describe(file)
+    parts = [file.with_name(f"{name}.yaml") for name in own.defaults if name.startswith("_")]
+    return replace(own, keys=[*own.keys, *(key for part in parts for key in describe(part).keys)])
+
+
 def _group(group: str, default: str | None) -> list[str]:
     files = sorted((CONF / group).glob("[!_]*.yaml"))
-    found = {file.stem: describe(file) for file in files}
+    found = {file.stem: _whole(file) for file in files}
     lines = [f"## {group}", "", *_options(group, found, default)]
     main = default if default in found else next(iter(found))
     if group == "experiment":
@@ -111,7 +119,7 @@ def _command(experiment: Description) -> str:
 
 
 def _changes(description: Description, main: Description, prefix: str) -> list[Key]:
-    """Return the keys that differ, named as on the command line, with the main file's comments."""
+    """Return the keys that differ or are new, in full, with the main file's comments."""
     known = {key.name: key for key in describe(CONF / "config.yaml").keys}
     known |= {f"{prefix}.{key.name}".lstrip("."): key for key in main.keys}
     known |= {f"eval.{key.name}": key for key in describe(CONF / "eval" / "default.yaml").keys}
@@ -119,7 +127,9 @@ def _changes(description: Description, main: Description, prefix: str) -> list[K
     for key in description.keys:
         # A file of package _global_ names its keys in full already.
         name = key.name if key.name in known else f"{prefix}.{key.name}"
-        if key.value != known[name].value:
+        if name not in known:  # what this option has besides
+            changed.append(Key(name, key.value, key.comment))
+        elif key.value != known[name].value:
             changed.append(Key(name, key.value, key.comment or known[name].comment))
     return changed
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import harmonic_mean
@@ -14,8 +15,8 @@ from pgdm.config.saved import check_run_dir, save_config
 from pgdm.config.schema import ExperimentCfg
 from pgdm.envs.build import EnvBuilder, EnvCfg
 from pgdm.envs.film import film_policy
-from pgdm.errors import PgdmError, RenderError, RunError
-from pgdm.library import Library, ensure
+from pgdm.errors import PgdmError, RenderError, RunError, UnknownNameError
+from pgdm.library import Library, ensure, ensure_expert
 from pgdm.library.provide import Spoken
 from pgdm.library.report import Progress as FetchProgress
 from pgdm.methods import recipe
@@ -23,6 +24,7 @@ from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.rl.evaluate import Evaluator
 from pgdm.rl.trainer import Extras, Outcome, Trainer, TrainerCfg
+from pgdm.stop import stoppable
 from pgdm.tracking import RunFolder, open_tracker
 from pgdm.tracking.provenance import git_revision, versions
 from pgdm.tracking.run_folder import RESULT, claimed, read_json, write_json
@@ -58,6 +60,19 @@ def env_builder(cfg: ExperimentCfg, library: Library) -> EnvBuilder:
     return EnvBuilder(library, env, recipe(cfg.method))
 
 
+def assets(cfg: ExperimentCfg, notify: Notify, progress: FetchProgress | None = None) -> Library:
+    """Open the library with all that an experiment needs in it; fetches what is missing.
+
+    Raises:
+        LibraryError: if something is missing and cannot be fetched.
+    """
+    library = ensure(cfg.task.motion, cfg.offline, notify, progress=progress)
+    if recipe(cfg.method).needs_expert:
+        with suppress(UnknownNameError):  # `env_builder` says which tasks have an expert
+            ensure_expert(cfg.task.motion, cfg.offline, notify, progress=progress)
+    return library
+
+
 def threads(cfg: ExperimentCfg) -> int:
     """Return the number of threads to use."""
     return cfg.num_threads or len(os.sched_getaffinity(0))
@@ -82,8 +97,7 @@ def run_experiment(
     """
     run_dir = Path(cfg.run_dir)
     check_run_dir(cfg)
-    progress = _stoppable(stop, Spoken(notify))
-    library = ensure(cfg.task.motion, cfg.offline, notify, progress=progress)
+    library = assets(cfg, notify, stoppable(stop, Spoken(notify)))
     with claimed(run_dir):
         builder = env_builder(cfg, library)
         return Run(cfg, builder, run_dir, notify).train(callbacks, stop)
@@ -140,8 +154,8 @@ class Run(Callback):
         if done and stored.get("status") == "finished":
             self._notify(f"{self.dir} is finished already; its result:")
             return self._stored_result(stored)
-        if self.builder.fallback_note:
-            self._notify(self.builder.fallback_note)
+        for note in self.builder.notes:
+            self._notify(note)
         trainer = self._make_trainer((self, *callbacks), stop)
         if state is not None:
             check_assets(state["metadata"], self.builder, self.dir, self._notify)
@@ -277,14 +291,3 @@ class Run(Callback):
             video=self.dir / video if video else None,
             pregrasp_used=stored["pregrasp_used"],
         )
-
-
-def _stoppable(stop: Callable[[], bool], inner: FetchProgress) -> FetchProgress:
-    """Let a fetch end at a stop request; what was downloaded stays for the next time."""
-
-    def progress(step: str, done: int, total: int) -> None:
-        if stop():
-            raise KeyboardInterrupt
-        inner(step, done, total)
-
-    return progress

@@ -58,12 +58,11 @@ def make_batch(
                 "other settings go into overrides=['key=value']"
             )
     from pgdm.config.store import compose
-    from pgdm.experiment import env_builder
-    from pgdm.library import ensure
+    from pgdm.experiment import assets, env_builder
 
     chosen = [f"{group}={option}" for group, option in choices.items()]
-    cfg = compose([f"task={task}", *chosen, *overrides])
-    builder = env_builder(cfg, ensure(cfg.task.motion, offline, _log.warning))
+    cfg = compose([f"task={task}", f"offline={str(offline).lower()}", *chosen, *overrides])
+    builder = env_builder(cfg, assets(cfg, _log.warning))
     return builder.make(num_envs, num_threads, seed, auto_reset=auto_reset)
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Callable
 from types import FrameType, TracebackType
+from typing import Protocol
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
 STOPPED = tuple(128 + number for number in _SIGNALS)
@@ -64,3 +66,25 @@ class StopRequest:
         again = "" if self._patient else " (again: stop at once)"
         sys.stderr.write(f"\n{how}: saving and stopping at the next safe point{again}\n")
         sys.stderr.flush()
+
+
+class Listener(Protocol):
+    """Told how far something long is."""
+
+    def __call__(self, step: str, done: int, total: int) -> None:
+        """Hear that ``done`` of ``total`` are done of a step."""
+        ...
+
+
+def stoppable(stop: Callable[[], bool], inner: Listener) -> Listener:
+    """Return a progress listener that lets what it listens to end at a stop request.
+
+    What was downloaded by then stays for the next time.
+    """
+
+    def progress(step: str, done: int, total: int) -> None:
+        if stop():
+            raise KeyboardInterrupt
+        inner(step, done, total)
+
+    return progress

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pgdm.cli.flags import Flags
+from pgdm.cli.flags import DRY_RUN, Flags
 from pgdm.errors import ConfigError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -72,9 +72,10 @@ def compose_all(flags: Flags) -> Composed:
         except COMPOSITION_ERRORS as error:
             raise explain(error, flags.overrides, flags.config_dir) from error
     stray = [override for override in flags.overrides if override.startswith(_OF_SWEEPS)]
+    if "--dry-run" in flags.ours:  # of one run, it shows the run's terms
+        stray.remove(DRY_RUN)
     if stray and found.jobs and not found.is_sweep:
-        shown = "--dry-run" if "--dry-run" in flags.ours else stray[0]
-        raise ConfigError(f"'{shown}' is for sweeps; add -m, or leave it out")
+        raise ConfigError(f"'{stray[0]}' is for sweeps; add -m, or leave it out")
     return found
 
 

@@ -14,8 +14,7 @@ from pgdm.config.schema import ExperimentCfg
 from pgdm.envs.build import EnvBuilder
 from pgdm.envs.film import film_policy
 from pgdm.errors import CheckpointError, RunError
-from pgdm.experiment import check_assets, env_builder, threads
-from pgdm.library import ensure
+from pgdm.experiment import assets, check_assets, env_builder, threads
 from pgdm.rl.checkpoint import CheckpointFolder, read_checkpoint
 from pgdm.rl.evaluate import Evaluator, load_policy
 from pgdm.rl.networks import ActorCritic
@@ -54,11 +53,11 @@ def evaluate_policy(request: EvalRequest) -> int:
         cfg = replace(cfg, seed=request.seed)
     policy, state = load_policy(checkpoint), read_checkpoint(checkpoint)
     frames = int(state["frames"])
-    library = ensure(cfg.task.motion, request.offline or cfg.offline, notify)
-    builder = env_builder(cfg, library)
+    cfg = replace(cfg, offline=request.offline or cfg.offline)
+    builder = env_builder(cfg, assets(cfg, notify))
     check_assets(state.get("metadata", {}), builder, checkpoint, notify)
-    if builder.fallback_note:
-        notify(builder.fallback_note)
+    for note in builder.notes:
+        notify(note)
     with StopRequest() as stop:
         metrics = _measure(cfg, builder, policy, request, checkpoint, stop)
     if metrics is None:

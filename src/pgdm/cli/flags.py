@@ -25,6 +25,8 @@ _VALUES: dict[str, tuple[str, ...] | None] = {
     "--info": _INFO,
 }
 _OURS = ("--help", "--version", "--debug", "--offline", "--dry-run")
+DRY_RUN = "sweep.dry_run=true"
+"""What ``--dry-run`` means in a sweep."""
 _HYDRAS = ("--multirun", "--resolve", "--hydra-help", "--shell-completion")
 
 
@@ -69,7 +71,7 @@ def read_flags(arguments: Sequence[str]) -> Flags:
             flags.ours.add(name)
         else:
             flags.hydras.append(name)
-    for flag, override in (("--offline", "offline=true"), ("--dry-run", "sweep.dry_run=true")):
+    for flag, override in (("--offline", "offline=true"), ("--dry-run", DRY_RUN)):
         if flag in flags.ours:
             flags.overrides.append(override)
     return flags

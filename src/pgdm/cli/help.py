@@ -30,7 +30,7 @@ Examples
 _FLAGS = """\
 Flags
   -m, --multirun     a sweep: one run for each combination of the values given as a,b,c
-  --dry-run          show the plan of a sweep, and start nothing
+  --dry-run          show the plan of a sweep, or the terms of a single run, and start nothing
   --offline          never use the network; missing assets are an error
   --config-dir DIR   your own settings beside pgdm's: DIR/task/mine.yaml is task=mine
   --cfg job          print all settings (--resolve: with references filled in), and do nothing

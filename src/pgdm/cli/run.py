@@ -43,13 +43,17 @@ def _main(flags: Flags, command: str, debug: bool) -> int:
         return 0
     # Here: they load the simulator and torch, and a wrong name should be answered before that.
     from pgdm.cli.plan import run_planned
-    from pgdm.cli.train import train
+    from pgdm.cli.train import show, train
     from pgdm.config.store import from_dict_config
 
     set_up_logging(debug)
     if composed.is_sweep:
         return run_planned(composed, default_name(typed, study), command)
-    return train(from_dict_config(composed.jobs[0][1]))
+    cfg = from_dict_config(composed.jobs[0][1])
+    if "--dry-run" in flags.ours:
+        show(cfg)
+        return 0
+    return train(cfg)
 
 
 class _NoticeHandler(logging.Handler):

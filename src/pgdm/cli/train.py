@@ -9,6 +9,7 @@ from rich.console import Console
 from pgdm.cli.errors import report
 from pgdm.cli.progress import ProgressView
 from pgdm.cli.summary import summary_table
+from pgdm.cli.terms import RECORDED_AS, term_line, term_table
 from pgdm.config.schema import ExperimentCfg
 from pgdm.experiment import RunResult, run_experiment
 from pgdm.stop import StopRequest
@@ -19,6 +20,13 @@ _PROGRESS = Console(stderr=True)
 def notify(text: str) -> None:
     """Tell what takes time, or differs from what was asked."""
     _PROGRESS.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def show(cfg: ExperimentCfg) -> None:
+    """Print what a run would be made of, and start nothing."""
+    Console().print(term_table(cfg))
+    print(RECORDED_AS)
+    print(f"run:    {cfg.run_dir} (nothing was started)")
 
 
 def train(cfg: ExperimentCfg, patient: bool = False) -> int:
@@ -34,6 +42,7 @@ def train(cfg: ExperimentCfg, patient: bool = False) -> int:
         PgdmError: if the run fails.
     """
     view = ProgressView(cfg.task.id, _PROGRESS)
+    notify(term_line(cfg))
     with StopRequest(patient) as stop:
         try:
             result = run_experiment(cfg, (view,), stop, notify)

@@ -29,8 +29,8 @@ def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> No
     cfg = compose([f"task={task}", f"pregrasp={pregrasp}"])
     builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
     start, reference = builder.mdp.start, builder.mdp.reference
-    if builder.fallback_note:
-        notify(builder.fallback_note)
+    for note in builder.notes:
+        notify(note)
     if video is None:
         from pgdm.sim.viewer import show_motion
 

@@ -58,7 +58,8 @@ def default_run_dir(cfg: ExperimentCfg) -> str:
     """Return the run folder, relative to the working directory, that belongs to an experiment."""
     start = f"{cfg.pregrasp.source}-{cfg.action.kind}-{cfg.algo.name}"
     name = f"{start}-s{cfg.seed}-{identity_hash(cfg)}"
-    return str(Path("runs") / cfg.task.id / cfg.method.name / name)
+    method = cfg.method.name.replace(":", ".")  # a user's own: no system forbids the dot
+    return str(Path("runs") / cfg.task.id / method / name)
 
 
 def difference(old: ExperimentCfg, new: ExperimentCfg) -> list[str]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Annotated
 
-from pgdm.config.strict import flatten
+from pgdm.config.strict import ChosenBy, flatten
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.mdp.actions import KINDS, ActionCfg
 from pgdm.mdp.observations import LAYOUTS, ObsCfg
-from pgdm.methods import METHODS, MethodCfg
+from pgdm.methods import MethodCfg, config_class
 from pgdm.motion.reference import FRAMES, ReferenceCfg
 from pgdm.pregrasp.sources import SOURCES, PregraspCfg
 from pgdm.rl.checkpoint import CheckpointCfg
@@ -37,7 +38,7 @@ class ExperimentCfg:
     """The hand that moves it."""
     pregrasp: PregraspCfg
     """Where an episode starts."""
-    method: MethodCfg
+    method: Annotated[MethodCfg, ChosenBy("name", config_class)]
     """Rewards, ends and metrics."""
     ablation: AblationCfg
     """What is taken away."""
@@ -85,6 +86,7 @@ class ExperimentCfg:
         flat = flatten(dataclasses.asdict(self))
         _check_choices(flat)
         _check_ranges(flat)
+        self.method.validate()
         check_batch(self.algo, self.num_envs)
         self._check_hand()
         self._check_placements()
@@ -127,7 +129,6 @@ class ExperimentCfg:
 _CHOICES: dict[str, tuple[str, ...]] = {
     "pregrasp.source": SOURCES,
     "pregrasp.fallback": SOURCES,
-    "method.name": tuple(METHODS),
     "ablation.name": ("none",),
     "obs.layout": tuple(LAYOUTS),
     "action.kind": tuple(KINDS),
@@ -159,9 +160,6 @@ _AT_LEAST: dict[str, int] = {
 }
 _ABOVE_ZERO = (
     "task.timestep_s",
-    "method.reward.tracking_scale",
-    "method.termination.max_object_error_m",
-    "method.success_threshold_m",
     "algo.learning_rate",
     "algo.adam_eps",
     "algo.clip",

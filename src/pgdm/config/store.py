@@ -191,11 +191,11 @@ def explain(
     if isinstance(error, YAMLError):
         return ConfigError(f"a settings file is not valid YAML: {text}")
     if isinstance(error, HydraException | OmegaConfBaseException):
-        return _explain_text(text)
+        return _explain_text(text, overrides, config_dir)
     return ConfigError(f"cannot apply {' '.join(overrides)}: {text}")
 
 
-def _explain_text(text: str) -> ConfigError:
+def _explain_text(text: str, overrides: Sequence[str], config_dir: str | None) -> ConfigError:
     if text.startswith("Ambiguous value"):
         argument = text.partition("'")[2].partition("'")[0]
         return ConfigError(
@@ -209,7 +209,8 @@ def _explain_text(text: str) -> ConfigError:
     if wrong and wrong[1] == "experiment":
         return ConfigError("an experiment is added with a plus: +experiment=NAME")
     if wrong:
-        return UnknownNameError("key", wrong[1], _known_names(), "(pgdm-run --help lists them)")
+        names = _known_names(overrides, config_dir)
+        return UnknownNameError("key", wrong[1], names, "(pgdm-run --help lists them)")
     return ConfigError(text)
 
 
@@ -236,7 +237,12 @@ def _explain_task(name: str, tasks: Sequence[str], config_dir: str | None) -> Co
     return UnknownNameError("task", name, [*known, *suites(config_dir)])
 
 
-def _known_names() -> list[str]:
-    """Return all keys of the default experiment, dotted, and all groups."""
-    plain: Any = OmegaConf.to_container(_composed(()), resolve=False)
-    return sorted({*flatten(plain), *groups()})
+def _known_names(overrides: Sequence[str], config_dir: str | None) -> list[str]:
+    """Return all keys of the experiment with the options that were chosen, dotted, and all groups.
+
+    The keys of a method depend on which one it is.
+    """
+    known = groups(config_dir)
+    chosen = [o for o in overrides if o.partition("=")[0] in known and "," not in o]
+    plain: Any = OmegaConf.to_container(_composed(chosen, config_dir), resolve=False)
+    return sorted({*flatten(plain), *known})

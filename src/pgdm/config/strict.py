@@ -6,7 +6,8 @@ import dataclasses
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
 
@@ -17,9 +18,24 @@ T = TypeVar("T")
 _KIND = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
 
 
+@dataclass(frozen=True)
+class ChosenBy:
+    """Marks a field whose class depends on one of its keys: ``Annotated[Base, ChosenBy(...)]``."""
+
+    key: str
+    """The key, whose value is text."""
+    find: Callable[[str], type]
+    """From its value to the class, a subclass of the one written down; raises ConfigError."""
+
+    def of(self, base: type, data: object) -> type:
+        """Return the class for some data, the base where they do not say it."""
+        name = data.get(self.key) if isinstance(data, Mapping) else None
+        return self.find(name) if isinstance(name, str) else base
+
+
 @cache
 def _hints(cls: type) -> dict[str, Any]:
-    return typing.get_type_hints(cls)
+    return typing.get_type_hints(cls, include_extras=True)
 
 
 def build(cls: type[T], data: object, path: str = "") -> T:
@@ -52,6 +68,9 @@ def build(cls: type[T], data: object, path: str = "") -> T:
 
 def _value(hint: Any, value: object, path: str) -> Any:
     origin = typing.get_origin(hint)
+    if origin is typing.Annotated:
+        base, chosen = typing.get_args(hint)
+        return _value(base if value is None else chosen.of(base, value), value, path)
     if origin in (types.UnionType, typing.Union):
         inner = [option for option in typing.get_args(hint) if option is not type(None)]
         return None if value is None else _value(inner[0], value, path)

@@ -19,7 +19,7 @@ from pgdm.mdp.context import StepContext
 from pgdm.mdp.metrics import Episodes
 from pgdm.mdp.observations import Observe
 from pgdm.mdp.recipe import Recipe
-from pgdm.motion.reference import ObjectReference
+from pgdm.motion.reference import ExpertReference, ObjectReference
 from pgdm.pregrasp.sources import StartState
 from pgdm.sim.batch import SimBatch, SimState
 from pgdm.sim.randomize import Randomizer
@@ -36,6 +36,7 @@ class Mdp:
     observe: Observe
     actions: ActionMap
     recipe: Recipe
+    expert: ExpertReference | None = None
 
 
 class BatchEnv:
@@ -73,6 +74,9 @@ class BatchEnv:
         self._t = torch.zeros(n, dtype=torch.int64)
         # Of each reward term, (2, K, N): weighted, then raw, summed over the episode.
         self._term_sums = torch.zeros(2, len(self._names), n, dtype=torch.float64)
+        # Of each measure, (2, M, N): summed over the episode's steps in which it applies, and their
+        # number.
+        self._measured = torch.zeros(2, len(mdp.recipe.measures), n, dtype=torch.float64)
         self._pos = torch.zeros(n, horizon, 3, dtype=torch.float64)
         self._quat = torch.zeros(n, horizon, 4, dtype=torch.float64)
         self._all = np.arange(n)
@@ -95,6 +99,7 @@ class BatchEnv:
         rows = torch.from_numpy(ids)
         self._t[rows] = 0
         self._term_sums[:, :, rows] = 0.0
+        self._measured[:, :, rows] = 0.0
         obs, self._pos[rows, 0], self._quat[rows, 0] = self._start
         if len(ids) == self.num_envs:
             self._obs = obs.repeat(self.num_envs, 1)
@@ -111,8 +116,9 @@ class BatchEnv:
             terminated (N,) bool, the object was lost or the motion ended; truncated (N,) bool,
             the simulation diverged; info with ``final_obs`` (N, D), ``qpos`` (N, nq),
             ``object_error_m`` (N,), ``success`` (N,) bool, ``terms`` {name: (N,)} weighted
-            rewards, ``raw_terms`` before weighting, ``ends`` {name: (N,) bool} and ``episodes``,
-            the `Finished` episodes, or None.
+            rewards, ``raw_terms`` before weighting, ``measures`` {name: (N,)}, NaN where they do
+            not apply, ``ends`` {name: (N,) bool} and ``episodes``, the `Finished` episodes, or
+            None.
         """
         if not self._auto_reset and bool((self._t >= len(self.mdp.reference) - 1).any()):
             raise RunError("the motion is over in at least one simulation; reset it before step()")
@@ -128,10 +134,12 @@ class BatchEnv:
         self._t = self._t + 1
         context = self._context(state)
         raw = torch.stack([term.value(context) for term in self.mdp.recipe.rewards])  # (K, N)
+        measures = {m.name: m.value(context) for m in self.mdp.recipe.measures}
         ends = {end.name: end.reached(context) for end in self.mdp.recipe.ends}
         final = self.mdp.observe(state, self._t)
         if some_diverged:
             raw = raw.masked_fill(diverged, 0.0)
+            measures = {k: v.masked_fill(diverged, torch.nan) for k, v in measures.items()}
             ends = {name: reached & ~diverged for name, reached in ends.items()}
             final[diverged] = self._obs[diverged]
             rows = diverged.nonzero()[:, 0]
@@ -140,6 +148,9 @@ class BatchEnv:
         reward = terms.sum(0)
         terminated = torch.stack(tuple(ends.values())).any(0)
         self._term_sums += torch.stack((terms, raw))
+        if measures:
+            values = torch.stack(tuple(measures.values()))
+            self._measured += torch.stack((values.nan_to_num(0.0), (~values.isnan()).double()))
         self._pos[self._rows, self._t], self._quat[self._rows, self._t] = self._poses(
             state, diverged if some_diverged else None
         )
@@ -152,6 +163,7 @@ class BatchEnv:
             "success": context.object_error <= self.mdp.recipe.metrics.success_threshold_m,
             "terms": dict(zip(self._names, terms.unbind(), strict=True)),
             "raw_terms": dict(zip(self._names, raw.unbind(), strict=True)),
+            "measures": measures,
             "ends": ends,
             "episodes": self._finished(finished, diverged, ends) if len(finished) else None,
         }
@@ -195,6 +207,8 @@ class BatchEnv:
             "quat": self._quat.clone(),
             "weights": self._weights.clone(),
         }
+        if self.mdp.recipe.measures:
+            state["measured"] = self._measured.clone()
         if self._randomize is not None:
             state["randomize"] = self._randomize.state_dict()
         return state
@@ -208,6 +222,8 @@ class BatchEnv:
         self._term_sums = state["term_sums"].clone()
         self._pos, self._quat = state["pos"].clone(), state["quat"].clone()
         self._weights = state["weights"].clone()
+        if self.mdp.recipe.measures:
+            self._measured = state["measured"].clone()
 
     def _read_start(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the observation (D,) and the object's position (3,) and quaternion (4,) at reset.
@@ -228,6 +244,8 @@ class BatchEnv:
             target_pos=reference.pos[self._t],
             target_quat=reference.quat[self._t],
             start_height=self._pos[:, 0, 2],
+            index=self.sim.scene.index,
+            expert=self.mdp.expert,
         )
 
     def _poses(self, state: SimState, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -247,5 +265,6 @@ class BatchEnv:
             recipe=self.mdp.recipe,
             episodes=Episodes(self._pos[rows], self._quat[rows], self._t[rows]),
             sums=self._term_sums[:, :, rows],
+            measured=self._measured[:, :, rows],
             flags=torch.stack((diverged, *ends.values()))[:, rows],
         )

@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 
 from pgdm.envs.batch_env import BatchEnv, Mdp
-from pgdm.errors import UnknownNameError
-from pgdm.library import Library
+from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.library import Expert, Library
 from pgdm.mdp.actions import ActionCfg, action_map
 from pgdm.mdp.observations import ObsCfg, layout
 from pgdm.mdp.recipe import Recipe
-from pgdm.motion.reference import FRAMES, ObjectReference, ReferenceCfg
+from pgdm.motion.reference import FRAMES, ExpertReference, ObjectReference, ReferenceCfg
 from pgdm.pregrasp.sources import PregraspCfg, start_state
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.randomize import Randomizer
@@ -37,8 +37,8 @@ class EnvBuilder:
     """Compiles a task once and makes batches of it.
 
     Raises:
-        PgdmError: if the library lacks an asset, the scene does not compile, or the start state
-            is not stored.
+        PgdmError: if the library lacks an asset, the scene does not compile, the start state is
+            not stored, or the recipe needs an expert that this task or hand does not have.
     """
 
     def __init__(self, library: Library, cfg: EnvCfg, recipe: Recipe) -> None:
@@ -48,33 +48,42 @@ class EnvBuilder:
         start = start_state(cfg.pregrasp, self.motion, self.scene)
         index = self.scene.index
         reference = _reference(cfg.reference, ObjectReference.of(self.motion), self.scene)
+        self.expert = _stored_expert(library, cfg) if recipe.needs_expert else None
         self.mdp = Mdp(
             reference=reference,
             start=start,
             observe=layout(cfg.obs, index, reference),
             actions=action_map(cfg.action, index, reference, torch.from_numpy(start.qpos)),
             recipe=recipe,
+            expert=None if self.expert is None else _followed(self.expert, self.scene),
         )
 
     @property
-    def fallback_note(self) -> str:
-        """A sentence that says so if episodes start elsewhere than was asked for, or nothing."""
-        used = self.mdp.start.source
-        if used == self._wanted:
-            return ""
-        return (
-            f"pregrasp '{self._wanted}' is not stored for {self.scene.task.id} in the "
-            f"{self.scene.asset_source} assets; starting from '{used}'"
-        )
+    def notes(self) -> list[str]:
+        """Sentences that say what differs from what was asked for, or from other tasks."""
+        task, used = self.scene.task.id, self.mdp.start.source
+        notes = []
+        if used != self._wanted:
+            notes.append(
+                f"pregrasp '{self._wanted}' is not stored for {task} in the "
+                f"{self.scene.asset_source} assets; starting from '{used}'"
+            )
+        if self.expert is not None and self.expert.approximate:
+            notes.append(
+                f"the expert hand trajectory of {task} is approximate: it was rebuilt from another "
+                "recording, as the published one is empty"
+            )
+        return notes
 
     def facts(self) -> dict[str, str]:
         """Return what a result depends on besides its configuration and the program."""
-        return {
+        facts = {
             "asset_source": self.scene.asset_source,
             "motion_sha256": self.motion.sha256,
             "scene_sha256": self.scene.digest(),
             "pregrasp_used": self.mdp.start.source,
         }
+        return facts if self.expert is None else facts | {"expert_sha256": self.expert.sha256}
 
     def make(
         self,
@@ -101,3 +110,33 @@ def _reference(cfg: ReferenceCfg, stored: ObjectReference, scene: Scene) -> Obje
         return stored
     com = scene.model.body_ipos[scene.index.object_body].copy()
     return stored.com_corrected(torch.from_numpy(com))
+
+
+# The hand that the experts' trajectories are joints of.
+_EXPERT_HAND, _EXPERT_FINGERTIPS = "adroit", 5
+
+
+def _stored_expert(library: Library, cfg: EnvCfg) -> Expert:
+    hand = cfg.hand
+    if hand.name != _EXPERT_HAND or len(hand.fingertips) != _EXPERT_FINGERTIPS:
+        raise ConfigError(
+            f"this method compares with an expert, whose hand is {_EXPERT_HAND} with "
+            f"{_EXPERT_FINGERTIPS} fingertips; hand '{hand.name}' with {len(hand.fingertips)} "
+            "cannot follow it: use hand=adroit, or method=pgdm or method=curriculum"
+        )
+    try:
+        return library.expert(cfg.task.motion)
+    except UnknownNameError as error:
+        raise ConfigError(
+            f"this method compares with an expert, and there is none for the motion "
+            f"'{cfg.task.motion}' of task '{cfg.task.id}'; tasks that have one: "
+            f"{', '.join(error.valid) or 'none in this library'}. Methods that need none: pgdm, "
+            "curriculum"
+        ) from error
+
+
+def _followed(expert: Expert, scene: Scene) -> ExpertReference:
+    model, nu = scene.model, scene.index.num_actuators
+    low, high = torch.from_numpy(model.jnt_range[:nu].copy()).unbind(1)
+    com = torch.from_numpy(model.body_ipos[scene.index.object_body].copy())
+    return ExpertReference.of(expert, low, high, com)

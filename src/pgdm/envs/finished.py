@@ -24,13 +24,17 @@ class Finished:
     recipe: Recipe
     episodes: Episodes
     sums: Tensor  # (2, K, k) of each reward term over the episode: weighted, then raw
+    measured: (
+        Tensor  # (2, M, k) of each measure: sum over the steps in which it applies, their count
+    )
     flags: Tensor  # (1 + E, k) bool: diverged, then each of the recipe's ends
 
     def metrics(self) -> dict[str, Tensor]:
         """Return each metric's values, (k,) float64; see `pgdm.mdp.metrics.episode_metrics`.
 
-        Beside those: ``return``, ``diverged``, ``end/<name>``, and of each reward term the sum
-        over the episode, ``term/<name>`` weighted and ``raw/<name>`` before.
+        Beside those: ``return``, ``diverged``, ``end/<name>``, the mean of each measure under its
+        name, NaN where it never applied, and of each reward term the sum over the episode,
+        ``term/<name>`` weighted and ``raw/<name>`` before.
         """
         metrics = episode_metrics(self.episodes, self.reference, self.recipe.metrics)
         metrics["return"] = self.sums[0].sum(0)
@@ -39,7 +43,9 @@ class Finished:
         for kind, sums in zip(("term", "raw"), self.sums, strict=True):
             terms = zip(self.recipe.rewards, sums, strict=True)
             metrics |= {f"{kind}/{term.name}": total for term, total in terms}
-        return metrics
+        total, steps = self.measured
+        names = [measure.name for measure in self.recipe.measures]
+        return metrics | dict(zip(names, total / steps, strict=True))  # no step: 0/0 is NaN
 
     def with_later(self, later: Sequence[Finished]) -> Finished:
         """Return these episodes and others of the same task as one, in this order."""
@@ -53,5 +59,6 @@ class Finished:
                 torch.cat([f.episodes.length for f in every]),
             ),
             torch.cat([f.sums for f in every], -1),
+            torch.cat([f.measured for f in every], -1),
             torch.cat([f.flags for f in every], -1),
         )

@@ -9,7 +9,15 @@ import torch
 from torch import Tensor
 
 from pgdm import rotations
+from pgdm.errors import ConfigError
+from pgdm.motion.reference import ExpertReference
 from pgdm.sim.batch import SimState
+from pgdm.sim.scene import SceneIndex
+
+SPACES = ("fingertips", "joints")
+"""In what two hands are compared."""
+FORMS = ("squared", "norm")
+"""How a difference becomes a number: |d|^2 or |d|."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +30,8 @@ class StepContext:
     target_pos: Tensor  # (n, 3) m, where the object's centre of mass should be
     target_quat: Tensor  # (n, 4) wxyz
     start_height: Tensor  # (n,) m, height of the object's centre of mass at reset
+    index: SceneIndex
+    expert: ExpertReference | None = None
 
     @cached_property
     def object_error(self) -> Tensor:
@@ -32,3 +42,66 @@ class StepContext:
     def object_angle(self) -> Tensor:
         """Angle between the object and its target, (n,) rad in [0, pi]."""
         return rotations.angle(self.state.object_quat, self.target_quat)
+
+    @cached_property
+    def fingertips(self) -> Tensor:
+        """Positions of the hand's fingertips, (n, F, 3) m."""
+        return self.state.point_pos[:, torch.from_numpy(self.index.fingertips)]
+
+    @cached_property
+    def joints(self) -> Tensor:
+        """Positions of the hand's joints, (n, nu) m and rad."""
+        return self.state.qpos[:, : self.index.num_actuators]
+
+    @cached_property
+    def fingertip_offset(self) -> Tensor:
+        """Fingertips minus the expert's at the same step, (n, F, 3) m."""
+        return self.fingertips - self._expert.fingertips[self.t]
+
+    @cached_property
+    def joint_offset(self) -> Tensor:
+        """Joints minus the expert's at the same step, (n, nu) m and rad."""
+        return self.joints - self._expert.joints[self.t]
+
+    @cached_property
+    def in_contact(self) -> Tensor:
+        """Which of the expert's fingers touch the object at the same step, (n, F) bool."""
+        return self._expert.in_contact[self.t]
+
+    @cached_property
+    def contact_points(self) -> Tensor:
+        """The expert's contact points on the object where it is now, (n, F, 3) m."""
+        s = self.state
+        return self._expert.contact_points(self.t, s.object_pos, s.object_quat)
+
+    @cached_property
+    def contact_distance(self) -> Tensor:
+        """Distance of each fingertip from its contact point, in contact or not, (n, F) m."""
+        return torch.linalg.vector_norm(self.contact_points - self.fingertips, dim=-1)
+
+    def hand_error(self, space: str, form: str) -> Tensor:
+        """Return how far the hand is from the expert's, (n,).
+
+        The hand is one vector: its fingertips' 3 F coordinates, m, or its nu joints, of which the
+        slides are in m and the hinges in rad. ``squared`` is the square of the difference's
+        length, ``norm`` the length itself.
+        """
+        squared = self._squared_fingertips if space == "fingertips" else self._squared_joints
+        return squared if form == "squared" else squared.sqrt()
+
+    @cached_property
+    def _squared_fingertips(self) -> Tensor:
+        return self.fingertip_offset.square().sum((1, 2))
+
+    @cached_property
+    def _squared_joints(self) -> Tensor:
+        return self.joint_offset.square().sum(1)
+
+    @property
+    def _expert(self) -> ExpertReference:
+        if self.expert is None:
+            raise ConfigError(
+                "a term of this method compares with an expert, but its recipe does not say so; "
+                "make it with Recipe(..., needs_expert=True)"
+            )
+        return self.expert

@@ -29,6 +29,14 @@ class EndTerm:
 
 
 @dataclass(frozen=True)
+class Measure:
+    """Something that is recorded of every step, and acts on nothing."""
+
+    name: str
+    value: Callable[[StepContext], Tensor]  # -> (n,), NaN where it does not apply
+
+
+@dataclass(frozen=True)
 class Recipe:
     """Everything about an MDP that a method may choose."""
 
@@ -38,7 +46,21 @@ class Recipe:
     schedules: tuple[Callable[[int], dict[str, float]], ...] = ()
     """From environment steps so far to reward weights by term name, asked before each iteration."""
 
+    measures: tuple[Measure, ...] = ()
+    """Recorded for each episode as the mean over its steps, under their names."""
+    needs_expert: bool = False
+    """Whether terms or measures compare with an expert's hand trajectory."""
+
     def table(self) -> list[tuple[str, str, str]]:
         """Return what is active as rows (kind, name, weight), for people to read."""
-        rows = [("reward", term.name, f"{term.weight:g}") for term in self.rewards]
-        return rows + [("end", term.name, "") for term in self.ends]
+        first = {name: w for schedule in self.schedules for name, w in schedule(0).items()}
+        rows = [
+            ("reward", term.name, _weight(term.weight, first.get(term.name)))
+            for term in self.rewards
+        ]
+        rows += [("end", end.name, "") for end in self.ends]
+        return rows + [("measure", measure.name, "") for measure in self.measures]
+
+
+def _weight(weight: float, first: float | None) -> str:
+    return f"{weight:g}" if first is None else f"{weight:g}, scheduled from {first:g}"

@@ -35,3 +35,25 @@ def lift(c: StepContext, height_m: float) -> Tensor:
     """Return 1 where object and target are both ``height_m`` above the start, (n,)."""
     lower = torch.minimum(c.target_pos[:, 2], c.state.object_pos[:, 2])
     return (lower >= c.start_height + height_m).double()
+
+
+def hand_imitation(c: StepContext, space: str, form: str, scale: float) -> Tensor:
+    """Return exp(-scale d), (n,) in (0, 1], d the hand's distance from the expert's.
+
+    ``space`` and ``form`` are those of `StepContext.hand_error`.
+    """
+    return torch.exp(-scale * c.hand_error(space, form))
+
+
+def fingertip_contact(c: StepContext, form: str, scale: float) -> Tensor:
+    """Return the mean of exp(-scale d) over the fingers in contact, (n,) in [0, 1].
+
+    d is a fingertip's distance from the expert's contact point, |d| or |d|^2. Where the expert
+    touches nothing, nothing is asked, and the term is 0: which steps these are depends on the
+    time alone, so the order of policies whose episodes are equally long is that of any other
+    constant, and what is logged is of contact only.
+    """
+    d = c.contact_distance
+    value = torch.exp(-scale * (d.square() if form == "squared" else d))
+    asked = c.in_contact
+    return torch.where(asked, value, 0.0).sum(1) / asked.sum(1).clamp(min=1)

@@ -25,3 +25,12 @@ def object_lost(c: StepContext, max_error_m: float) -> Tensor:
 def motion_ended(c: StepContext) -> Tensor:
     """Return whether the motion is over, (n,) bool: a true terminal in R, nothing follows it."""
     return c.t >= c.last_t
+
+
+def hand_lost(c: StepContext, space: str, form: str, max_error: float, grace_steps: int) -> Tensor:
+    """Return whether the hand is further than ``max_error`` from the expert's, (n,) bool.
+
+    Never in the first ``grace_steps`` steps: some stored pre-grasps begin beyond the limit.
+    ``space`` and ``form`` are those of `StepContext.hand_error`.
+    """
+    return (c.t > grace_steps) & (c.hand_error(space, form) > max_error)

@@ -1,28 +1,37 @@
-"""Methods: each turns a configuration into a Recipe. One row each."""
+"""Methods: each turns its settings into a Recipe. One row each; users' own ones need none."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from pgdm.errors import UnknownNameError
 from pgdm.mdp.recipe import Recipe
-from pgdm.methods import pgdm
+from pgdm.methods import curriculum, deepmimic, full, graff, pgdm
+from pgdm.methods.method import Method, find
 from pgdm.methods.pgdm import MethodCfg
 
-METHODS: dict[str, Callable[[MethodCfg], Recipe]] = {
-    "pgdm": pgdm.recipe,
+METHODS: dict[str, Method] = {
+    "pgdm": Method(MethodCfg, pgdm.recipe),
+    "deepmimic": Method(deepmimic.DeepMimicCfg, deepmimic.recipe),
+    "graff": Method(graff.GraffCfg, graff.recipe),
+    "curriculum": Method(curriculum.CurriculumCfg, curriculum.recipe),
+    "full": Method(full.FullCfg, full.recipe),
 }
+
+
+def config_class(name: str) -> type[MethodCfg]:
+    """Return the class of a method's settings.
+
+    Raises:
+        ConfigError: if there is no such method.
+    """
+    return find(name, METHODS).config
 
 
 def recipe(cfg: MethodCfg) -> Recipe:
     """Return the configured method's Recipe.
 
     Raises:
-        UnknownNameError: if there is no such method.
+        ConfigError: if there is no such method.
     """
-    if cfg.name not in METHODS:
-        raise UnknownNameError("method", cfg.name, METHODS)
-    return METHODS[cfg.name](cfg)
+    return find(cfg.name, METHODS).recipe(cfg)
 
 
-__all__ = ["METHODS", "MethodCfg", "recipe"]
+__all__ = ["METHODS", "Method", "MethodCfg", "config_class", "recipe"]

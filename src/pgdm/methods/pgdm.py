@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
+from pgdm.errors import ConfigError
 from pgdm.mdp import rewards, terminations
 from pgdm.mdp.metrics import MetricsCfg
 from pgdm.mdp.recipe import EndTerm, Recipe, RewardTerm
@@ -14,16 +15,37 @@ from pgdm.mdp.terminations import TerminationCfg
 
 @dataclass(frozen=True)
 class MethodCfg:
-    """A method: its name and the numbers of its terms."""
+    """What every method has: its name, and the numbers of PGDM's terms, on which it builds."""
 
     name: str
-    """Which method; a row of ``pgdm.methods.METHODS``."""
+    """Which method; a row of ``pgdm.methods.METHODS``, or ``my_package.module:attribute``."""
     reward: RewardCfg
     """Object reward."""
     termination: TerminationCfg
     """Early ends."""
     success_threshold_m: float
     """Distance at which a step counts as a success in the metrics, m."""
+
+    def validate(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            ConfigError: at the first one that cannot be right.
+        """
+        check_above_zero("method.reward.tracking_scale", self.reward.tracking_scale)
+        limit = self.termination.max_object_error_m
+        check_above_zero("method.termination.max_object_error_m", limit)
+        check_above_zero("method.success_threshold_m", self.success_threshold_m)
+
+
+def check_above_zero(key: str, value: float) -> None:
+    """Check a number of the settings.
+
+    Raises:
+        ConfigError: if it is 0 or less.
+    """
+    if value <= 0:
+        raise ConfigError(f"{key} is {value}; it must be above 0")
 
 
 def recipe(cfg: MethodCfg) -> Recipe:

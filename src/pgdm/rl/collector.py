@@ -66,13 +66,18 @@ class Rollout:
         )
 
     def metrics(self) -> dict[str, float]:
-        """Return the mean reward of a step, and the means over the finished episodes, if any."""
+        """Return the mean reward of a step, and the means over the finished episodes, if any.
+
+        An episode in which a metric does not apply has NaN, and is left out of its mean.
+        """
         count = int((self.terminated | self.truncated).sum())
         metrics = {"reward": float(self.reward.mean()), "episodes": float(count)}
         if not self.finished:
             return metrics
         episodes = self.finished[0].with_later(self.finished[1:]).metrics()
-        return metrics | {name: float(values.double().mean()) for name, values in episodes.items()}
+        return metrics | {
+            name: float(values.double().nanmean()) for name, values in episodes.items()
+        }
 
 
 class Collector:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -136,12 +137,16 @@ class Evaluator:
 
 
 def summarise(results: dict[str, Tensor], prefix: str = "") -> dict[str, float]:
-    """Return each metric's mean over its episodes (k,), and its spread where k > 1."""
+    """Return each metric's mean over its episodes (k,), and its spread where k > 1.
+
+    Episodes in which a metric does not apply have NaN, and are left out.
+    """
     summary: dict[str, float] = {}
     for name, values in results.items():
-        summary[f"{prefix}{name}"] = float(values.mean())
+        known = values[~values.isnan()]
+        summary[f"{prefix}{name}"] = float(known.mean())
         if len(values) > 1:
-            summary[f"{prefix}{name}_std"] = float(values.std())
+            summary[f"{prefix}{name}_std"] = float(known.std()) if len(known) > 1 else math.nan
     return summary
 
 

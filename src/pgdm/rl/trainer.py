@@ -154,11 +154,14 @@ class Trainer:
 
     def _iterate(self) -> None:
         """Collect one rollout and learn from it."""
+        weights: dict[str, float] = {}
         for schedule in self.extras.schedules:
-            self.env.set_weights(schedule(self._frames))
+            weights |= schedule(self._frames)
+        self.env.set_weights(weights)
         start = time.monotonic()
         rollout = self._collector.collect()
         metrics = rollout.metrics() | self._learner.learn(rollout)
+        metrics |= {f"weight/{name}": weight for name, weight in weights.items()}
         metrics["steps_per_s"] = self._collector.frames / (time.monotonic() - start)
         self._frames += self._collector.frames
         self._iteration += 1

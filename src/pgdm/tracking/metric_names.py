@@ -33,10 +33,21 @@ METRICS = (
     Metric("raw/<name>", "both", "-", "sum of a reward term over the episode, before weighting"),
     Metric("term/<name>", "both", "reward", "part of the return that a weighted term gave"),
     Metric("end/<name>", "both", "0..1", "share of episodes that this condition ended"),
+    Metric(
+        "hand_error_m", "both", "m", "mean distance of fingertips from the expert's, over the steps"
+    ),
+    Metric("hand_error_rad", "both", "rad", "mean angle between finger joints and the expert's"),
+    Metric(
+        "contact_distance_m",
+        "both",
+        "m",
+        "mean distance of fingertips from the expert's contact points, where it touches the object",
+    ),
     Metric("diverged", "both", "0..1", "share of episodes that ended in a diverged simulation"),
     Metric("<name>_std", "eval", "as <name>", "standard deviation over the sampled episodes"),
     Metric("episodes", "train", "episodes", "episodes that ended in the iteration"),
     Metric("reward", "train", "reward", "mean reward of a step"),
+    Metric("weight/<name>", "train", "-", "weight of a reward term that has a schedule"),
     Metric("steps_per_s", "train", "1/s", "environment steps a second, learning included"),
     Metric("loss_policy", "train", "-", "PPO's clipped policy loss"),
     Metric("loss_value", "train", "reward^2", "squared error of the value, unweighted"),

@@ -1,0 +1,75 @@
+"""Short trainings behind a stored result: ordinary runs, so that stopped ones go on."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pgdm.tracking.run_folder import read_json
+from pgdm.tracking.run_log import RunLog
+
+AT_A_TIME = 2
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run."""
+
+    task: str
+    setting: str
+    overrides: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of its folder and of its stored result."""
+        return f"{self.task}-{self.setting}"
+
+
+def train(folder: Path, job: Job) -> int:
+    """Train one run to its end, or go on with it; return the exit code."""
+    command = [str(Path(sys.executable).with_name("pgdm-run")), f"task={job.task}", *job.overrides]
+    command += [f"run_dir={folder / job.name}", "num_threads=1", "tracking=none"]
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / f"{job.name}.log", "a") as log:
+        return subprocess.run(command, stdout=log, stderr=log).returncode
+
+
+def train_all(folder: Path, jobs: Sequence[Job]) -> None:
+    """Train all that is missing, a few at a time, one thread each.
+
+    Raises:
+        SystemExit: if one failed, after all have had their turn.
+    """
+    with ThreadPoolExecutor(AT_A_TIME) as pool:
+        codes = list(pool.map(lambda job: train(folder, job), jobs))
+    failed = [job.name for job, code in zip(jobs, codes, strict=True) if code]
+    if failed:
+        raise SystemExit(f"failed: {', '.join(failed)}; see the logs in {folder}")
+
+
+def finished(run: Path) -> dict[str, Any] | None:
+    """Return the result of a run without its film, or None if it has not finished."""
+    result = read_json(run / "result.json")
+    if result.get("status") != "finished":
+        return None
+    return {key: value for key, value in result.items() if key != "video"}
+
+
+def curves(run: Path, kind: str, names: Sequence[str]) -> dict[str, list[float]]:
+    """Return metrics of a run over its records of a kind, rounded, beside their ``frames``.
+
+    Args:
+        run: its folder.
+        kind: ``train`` or ``eval``.
+        names: metrics; NaN where one was not recorded.
+    """
+    lines = [line for line in RunLog(run / "metrics.jsonl").read() if line["kind"] == kind]
+    found: dict[str, list[float]] = {"frames": [int(line["frames"]) for line in lines]}
+    for name in names:
+        found[name] = [round(float(line.get(name, float("nan"))), 5) for line in lines]
+    return found

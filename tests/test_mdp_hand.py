@@ -1,0 +1,151 @@
+"""Terms that compare the hand with an expert's, against numbers worked by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from pgdm.errors import ConfigError
+from pgdm.mdp import rewards, terminations
+from pgdm.mdp.context import StepContext
+from pgdm.mdp.measures import contact_distance, finger_joint_error, fingertip_error
+from pgdm.mdp.schedules import Ramp
+from pgdm.motion.reference import ExpertReference
+from pgdm.sim.batch import SimState
+from pgdm.sim.scene import SceneIndex
+
+QUARTER_Z = [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+
+
+def double(values: object) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+INDEX = SceneIndex(
+    point_geoms=np.array([0, 1, 2]),
+    point_bodies=np.array([0, 1, 2]),
+    object_body=3,
+    fingertips=np.array([2, 1]),  # two fingers, the last point first
+    num_actuators=4,
+    num_compensated=4,
+    num_base_joints=1,
+    ctrl_low=-np.ones(4),
+    ctrl_high=np.ones(4),
+    mount_pos=np.zeros(3),
+    mount_quat=np.array([1.0, 0, 0, 0]),
+    randomized_geom=None,
+)
+
+EXPERT = ExpertReference(
+    joints=double([[0.0, 0, 0, 0], [0.1, 0.2, 0.3, 0.4], [0.0, 0, 0, 0]]),
+    fingertips=double([[[0.0, 0, 0]] * 2, [[0.1, 0, 0], [0, 0.2, 0]], [[0.0, 0, 0]] * 2]),
+    # From the centre of mass along the body's axes: 1 cm along x, 2 cm along y.
+    contacts=double([[[9.0, 9, 9]] * 2, [[0.01, 0, 0], [0, 0.02, 0]], [[9.0, 9, 9]] * 2]),
+    in_contact=torch.tensor([[False, False], [True, True], [True, False]]),
+)
+
+
+def context(t: int = 1, expert: ExpertReference | None = EXPERT) -> StepContext:
+    """One simulation: fingertips at (0.1, 0, 0.03) and (0.04, 0.2, 0); the object at (0, 0.3, 0),
+    turned a quarter about z."""
+    state = SimState(
+        qpos=double([[0.4, 0.2, 0.0, 0.4, 7.0]]),  # the last is the object's
+        qvel=double([[0.0] * 5]),
+        point_pos=double([[[5.0, 5, 5], [0.04, 0.2, 0.0], [0.1, 0.0, 0.03]]]),
+        point_quat=double([[[1.0, 0, 0, 0]] * 3]),
+        point_vel=double([[[0.0] * 6] * 3]),
+        object_pos=double([[0.0, 0.3, 0.0]]),
+        object_quat=double([QUARTER_Z]),
+        object_vel=double([[0.0] * 6]),
+    )
+    steps = torch.tensor([t])
+    zero = double([[0.0, 0, 0]])
+    return StepContext(state, steps, 2, zero, double([[1.0, 0, 0, 0]]), zero[:, 0], INDEX, expert)
+
+
+@pytest.mark.parametrize(
+    ("space", "form", "error"),
+    [
+        # Tips are off by (0, 0, 0.03) and (0.04, 0, 0): as one vector 0.05 long.
+        ("fingertips", "norm", 0.05),
+        ("fingertips", "squared", 0.0025),
+        # Joints are off by 0.3 m of slide and 0.3 rad of the second hinge.
+        ("joints", "squared", 0.18),
+        ("joints", "norm", math.sqrt(0.18)),
+    ],
+)
+def test_hand_error_and_what_follows_from_it(space: str, form: str, error: float) -> None:
+    c = context()
+    assert c.hand_error(space, form).item() == pytest.approx(error)
+    reward = rewards.hand_imitation(c, space, form, 15.0)
+    assert reward.item() == pytest.approx(math.exp(-15.0 * error))
+    lost = [
+        terminations.hand_lost(c, space, form, limit, grace_steps=0).item()
+        for limit in (0.99 * error, 1.01 * error)
+    ]
+    assert lost == [True, False]
+
+
+@pytest.mark.parametrize(("grace", "lost"), [(0, True), (1, False), (2, False)])
+def test_the_hand_is_not_lost_in_the_first_steps(grace: int, lost: bool) -> None:
+    c = context(t=1)  # the first step's state has t = 1
+    flag = terminations.hand_lost(c, "fingertips", "norm", 0.01, grace_steps=grace)
+    assert flag.tolist() == [lost]
+
+
+def test_contact_points_go_with_the_object() -> None:
+    # A quarter turn about z takes the body's x to the world's y and its y to -x.
+    points = context().contact_points
+    torch.testing.assert_close(points, double([[[0.0, 0.31, 0.0], [-0.02, 0.3, 0.0]]]))
+
+
+FIRST = math.sqrt(0.1**2 + 0.31**2 + 0.03**2)
+SECOND = math.sqrt(0.06**2 + 0.1**2)
+
+
+def test_contact_reward_is_the_mean_over_fingers() -> None:
+    c = context()
+    norm = 0.5 * (math.exp(-15 * FIRST) + math.exp(-15 * SECOND))
+    squared = 0.5 * (math.exp(-15 * FIRST**2) + math.exp(-15 * SECOND**2))
+    assert rewards.fingertip_contact(c, "norm", 15.0).item() == pytest.approx(norm)
+    assert rewards.fingertip_contact(c, "squared", 15.0).item() == pytest.approx(squared)
+    assert contact_distance(c).item() == pytest.approx((FIRST + SECOND) / 2)
+
+
+def test_only_fingers_in_contact_count() -> None:
+    # At step 2 the first finger alone, at (9, 9, 9) of the body: (-9, 9.3, 9) in the world.
+    distance = math.sqrt(9.1**2 + 9.3**2 + 8.97**2)
+    c = context(t=2)
+    expected = math.exp(-0.1 * distance)
+    assert rewards.fingertip_contact(c, "norm", 0.1).item() == pytest.approx(expected)
+    assert contact_distance(c).item() == pytest.approx(distance)
+
+
+def test_nothing_is_asked_or_paid_where_the_expert_touches_nothing() -> None:
+    c = context(t=0)
+    assert rewards.fingertip_contact(c, "squared", 15.0).item() == 0.0
+    assert math.isnan(contact_distance(c).item())
+
+
+def test_errors_in_plain_units() -> None:
+    c = context()
+    assert fingertip_error(c).item() == pytest.approx(0.035)  # mean of 3 and 4 cm
+    assert finger_joint_error(c).item() == pytest.approx(0.1)  # 0, 0.3, 0 rad; not the slide
+
+
+@pytest.mark.parametrize("term", [fingertip_error, finger_joint_error, contact_distance])
+def test_a_recipe_that_forgot_its_expert_is_told(term: Callable[[StepContext], Tensor]) -> None:
+    with pytest.raises(ConfigError, match="needs_expert=True"):
+        term(context(expert=None))
+
+
+@pytest.mark.parametrize(
+    ("frames", "weight"), [(0, 0.0), (1_000_000, 2.5), (4_000_000, 10.0), (50_000_000, 10.0)]
+)
+def test_the_ramp_is_a_line_and_then_level(frames: int, weight: float) -> None:
+    assert Ramp("tracking", 10.0, 4_000_000)(frames) == {"tracking": weight}

@@ -1,0 +1,245 @@
+"""Each method in its real environment: what it adds, what it needs, and what it records."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from command_line import TINY, command
+from pgdm.config.groups import available
+from pgdm.config.identity import default_run_dir, identity, identity_hash
+from pgdm.config.saved import load_config, save_config
+from pgdm.config.store import compose
+from pgdm.envs.batch_env import BatchEnv
+from pgdm.envs.build import EnvBuilder, EnvCfg
+from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.library import Expert, Library, open_library
+from pgdm.methods import METHODS, recipe
+from pgdm.tracking.run_log import RunLog
+
+PGDM = {"tracking", "lift"}
+ADDED = {
+    "pgdm": set(),
+    "deepmimic": {"imitation"},
+    "graff": {"contact"},
+    "curriculum": set(),
+    "full": {"imitation", "contact"},
+}
+
+
+class MadeUp(Library):
+    """The library, in which a task's expert keeps the hand where the task's start has it."""
+
+    def expert(self, task: str) -> Expert:
+        """Return it; only one task has one."""
+        if task != "cup-pour1":
+            raise UnknownNameError("expert hand trajectory", task, ["cup-pour1"])
+        motion = self.motion(task)
+        steps = len(motion.translation)
+        return Expert(
+            task=task,
+            qpos=np.tile(motion.starts["mined"].qpos[:30], (steps, 1)),
+            human_joints=np.zeros((steps, 16, 3)),
+            fingertips=np.full((steps, 5, 3), 0.5),
+            contacts=np.zeros((steps, 5, 3)),
+            in_contact=np.arange(steps)[:, None] >= [3, 3, 99, 99, 99],
+            approximate=True,
+            sha256="made up",
+        )
+
+
+def build(*overrides: str) -> EnvBuilder:
+    cfg = compose(["task=cup-pour1", *overrides])
+    env = EnvCfg(cfg.task, cfg.hand, cfg.sim, cfg.pregrasp, cfg.obs, cfg.action, cfg.reference)
+    library = open_library()
+    folders = {source: library.folder(source) for source in library.sources()}
+    return EnvBuilder(MadeUp(library.root, library.sources(), folders), env, recipe(cfg.method))
+
+
+def steps(env: BatchEnv, count: int) -> dict:
+    info: dict = {}
+    for _ in range(count):
+        *_, info = env.step(env.warm_start().repeat(env.num_envs, 1))
+    return info
+
+
+def test_every_method_has_its_file_of_settings() -> None:
+    assert set(available("method")) == set(METHODS)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_settings_have_their_own_class_and_survive_saving(method: str, tmp_path: Path) -> None:
+    cfg = compose([f"method={method}", f"run_dir={tmp_path / 'run'}"])
+    assert type(cfg.method) is METHODS[method].config
+    assert {term.name for term in recipe(cfg.method).rewards} == PGDM | ADDED[method]
+    save_config(cfg, tmp_path / "run")
+    assert load_config(tmp_path / "run") == cfg
+
+
+def test_settings_of_a_method_tell_runs_apart() -> None:
+    plain = compose(["method=deepmimic"])
+    joints = compose(["method=deepmimic", "method.imitation.space=joints"])
+    assert identity_hash(plain) != identity_hash(joints)
+    assert identity(joints)["method.imitation.space"] == "joints"
+    assert "/deepmimic/" in default_run_dir(joints)
+    assert not any("imitation" in key for key in identity(compose()))
+
+
+@pytest.mark.parametrize("left_out", ["imitation", "contact", "curriculum"])
+def test_full_leaves_out_what_is_null(left_out: str) -> None:
+    made = recipe(compose(["method=full", f"method.{left_out}=null"]).method)
+    names = {term.name for term in made.rewards}
+    assert names == PGDM | ({"imitation", "contact"} - {left_out})
+    assert bool(made.schedules) is (left_out != "curriculum")
+    assert ("hand_lost" in {end.name for end in made.ends}) is (left_out != "imitation")
+
+
+def test_without_expert_terms_none_is_asked_for() -> None:
+    cfg = compose(["method=full", "method.imitation=null", "method.contact=null"])
+    assert recipe(cfg.method).needs_expert is False
+    assert recipe(cfg.method).measures == ()
+
+
+def test_the_table_names_all_that_is_active() -> None:
+    assert recipe(compose(["method=full"]).method).table() == [
+        ("reward", "tracking", "10, scheduled from 0"),
+        ("reward", "lift", "2.5"),
+        ("reward", "imitation", "1"),
+        ("reward", "contact", "1"),
+        ("end", "object_lost", ""),
+        ("end", "motion_ended", ""),
+        ("end", "hand_lost", ""),
+        ("measure", "hand_error_m", ""),
+        ("measure", "hand_error_rad", ""),
+        ("measure", "contact_distance_m", ""),
+    ]
+
+
+def test_a_dry_run_of_one_run_shows_its_terms(tmp_path: Path) -> None:
+    outcome = command("pgdm-run", "task=cup-pour1", "method=curriculum", "--dry-run")
+    assert outcome.code == 0
+    assert re.search(r"reward +tracking +10, scheduled from 0", outcome.out)
+    assert "train/weight/NAME" in outcome.out
+    assert "nothing was started" in outcome.out
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("pregrasp", ["planned", "mined", "none"])
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_plays_from_every_start(
+    method: str, pregrasp: str, library_home: Path
+) -> None:
+    builder = build(f"method={method}", f"pregrasp={pregrasp}")
+    env = builder.make(2, 1)
+    info = steps(env, 3)
+    assert set(info["raw_terms"]) == set(info["terms"]) == PGDM | ADDED[method]
+    expert = method in ("deepmimic", "graff", "full")
+    assert set(info["measures"]) == (
+        {"hand_error_m", "hand_error_rad", "contact_distance_m"} if expert else set()
+    )
+    assert ("expert_sha256" in builder.facts()) is expert
+    assert any("approximate" in note for note in builder.notes) is expert
+
+
+def test_the_expert_is_clipped_and_its_contacts_are_seen_from_the_centre_of_mass(
+    library_home: Path,
+) -> None:
+    builder = build("method=graff")
+    expert, index, model = builder.mdp.expert, builder.scene.index, builder.scene.model
+    assert expert is not None
+    ranges = torch.from_numpy(model.jnt_range[:30].copy())
+    assert (expert.joints >= ranges[:, 0]).all() and (expert.joints <= ranges[:, 1]).all()
+    env = builder.make(1, 1)
+    steps(env, 3)
+    context = env._context(env.sim.read())
+    # The made-up contact points are the origin of the object's body, wherever it lies.
+    origin = torch.from_numpy(env.sim.data(0).xpos[index.object_body].copy())
+    torch.testing.assert_close(context.contact_points[0], origin.expand(5, 3))
+
+
+def test_measures_of_an_episode_are_means_over_the_steps_they_apply_to(library_home: Path) -> None:
+    env = build("method=graff").make(1, 1)
+    seen: dict[str, list[Tensor]] = {}
+    episode: dict[str, Tensor] = {}
+    while not episode:
+        info = steps(env, 1)
+        for name, value in info["measures"].items():
+            seen.setdefault(name, []).append(value)
+        episode = info["episodes"]
+    for name, values in seen.items():
+        torch.testing.assert_close(episode[name], torch.cat(values).nanmean()[None])
+    assert math.isnan(seen["contact_distance_m"][1].item())  # step 2: nothing is touched yet
+    assert not math.isnan(seen["contact_distance_m"][2].item())
+    again = steps(env, 1)  # and the next episode begins from nothing
+    torch.testing.assert_close(env._measured[0, 0], again["measures"]["hand_error_m"])
+
+
+def test_the_hand_ends_an_episode_after_its_grace_and_is_counted(library_home: Path) -> None:
+    # The made-up fingertips are far above the table: lost as soon as that is looked at.
+    env = build("method=deepmimic", "method.imitation.grace_steps=4").make(2, 1)
+    assert not any(steps(env, 1)["ends"]["hand_lost"].any() for _ in range(4))
+    info = steps(env, 1)
+    assert info["ends"]["hand_lost"].tolist() == [True, True]
+    assert info["episodes"]["end/hand_lost"].tolist() == [1.0, 1.0]
+    assert info["episodes"]["length"].tolist() == [5.0, 5.0]
+    assert "raw/imitation" in info["episodes"] and "term/imitation" in info["episodes"]
+
+
+def test_states_go_on_to_the_bit(library_home: Path) -> None:
+    builder = build("method=full")
+    one, other = builder.make(2, 1), builder.make(2, 1)
+    steps(one, 7)
+    other.load_state_dict(one.state_dict())
+    for _ in range(8):
+        a, b = steps(one, 1), steps(other, 1)
+        assert a["episodes"].keys() == b["episodes"].keys()
+        for name, value in a["episodes"].items():
+            assert torch.equal(value.nan_to_num(), b["episodes"][name].nan_to_num())
+
+
+def test_a_task_or_hand_without_expert_is_told_who_has_one(library_home: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none for .*'duck-lift'; tasks that .*: cup-pour1\. Me"):
+        build("task=duck-lift", "method=deepmimic")
+    with pytest.raises(ConfigError, match="'dhand' with 4 cannot follow it: use hand=adroit, or"):
+        build("task=dhand-cup", "method=graff")
+
+
+def test_a_curriculum_is_recorded_and_does_not_act_on_evaluations(library_home: Path) -> None:
+    outcome = command(
+        "pgdm-run", *TINY, "task=cup-pour1", "method=curriculum", "run_dir=run", "--offline",
+        "method.curriculum.ramp_frames=32",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.err
+    assert "rewards tracking 10, scheduled from 0, lift 2.5; ends object_lost" in outcome.err
+    lines = RunLog(Path("run/metrics.jsonl")).read()
+    trained = [line for line in lines if line["kind"] == "train"]
+    assert [line["train/weight/tracking"] for line in trained] == [0.0, 5.0]
+    first = next(line for line in lines if line["kind"] == "eval")
+    whole = 10 * float(first["eval_sampled/raw/tracking"])
+    assert float(first["eval_sampled/term/tracking"]) == pytest.approx(whole)
+    assert whole > 0
+
+
+def test_a_method_of_ones_own_needs_no_change_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_method.py").write_text(
+        "from pgdm.methods import Method, MethodCfg\nfrom pgdm.methods.pgdm import recipe\n"
+        "OWN = Method(MethodCfg, recipe)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    cfg = compose(["method.name='own_method:OWN'", f"run_dir={tmp_path / 'run'}"])
+    assert [term.name for term in recipe(cfg.method).rewards] == ["tracking", "lift"]
+    assert "/own_method.OWN/" in default_run_dir(cfg)
+    save_config(cfg, tmp_path / "run")
+    assert load_config(tmp_path / "run") == cfg
+    with pytest.raises(ConfigError, match=r"'OWNN' of .* it has: OWN"):
+        compose(["method.name='own_method:OWNN'"])
+    sys.modules.pop("own_method")
