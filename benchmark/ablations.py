@@ -13,6 +13,7 @@ import csv
 import dataclasses
 import time
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +50,16 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
     """Return the summary as a table in Markdown: largest values over the tasks."""
     names = (
         *("start", "ablation", "tasks", "simulated", "retreated", "retreat [mm]"),
-        *("distance [cm]", "finger error [rad]", "object pushed [mm]", "penetration [mm]", "time [s]"),
+        *(
+            "distance [cm]",
+            "finger error [rad]",
+            "object pushed [mm]",
+            "penetration [mm]",
+            "time [s]",
+        ),
     )
     table = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
-    key = lambda row: (row["pregrasp"], row["ablation"])  # noqa: E731
+    key = itemgetter("pregrasp", "ablation")
     for (pregrasp, ablation), group in groupby(sorted(rows, key=key), key):
         some = list(group)
 

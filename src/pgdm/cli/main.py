@@ -123,11 +123,22 @@ def view(
     pregrasp: Annotated[
         str, typer.Option(help="Start state that shows the hand: planned, mined, learned or none.")
     ] = "planned",
+    ablations: Annotated[
+        bool, typer.Option("--ablations", help="Show the start under each ablation instead.")
+    ] = False,
+    image: Annotated[
+        Path | None, typer.Option(help="With --ablations: write the pictures to this PNG.")
+    ] = None,
     offline: Annotated[bool, typer.Option("--offline", help="Never use the network.")] = False,
 ) -> None:
     """Replay a task's exemplar motion with the hand at its pre-grasp."""
+    from pgdm.cli.ablations import view_ablations
     from pgdm.cli.view import view_task
 
+    if ablations and video is None:
+        return view_ablations(task, image, pregrasp, offline)
+    if ablations or image is not None:
+        raise ConfigError("--ablations and --image FILE go together, and without --video")
     view_task(task, video, pregrasp, offline)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 
 from pgdm.errors import ConfigError, SceneError, UnknownNameError
@@ -23,7 +24,7 @@ REACH_TOLERANCE_RAD = 0.2
 0.1 rad behind where tendons couple two joints."""
 RETREAT_STEP_M, SLOW_STEP_M = 0.001, 0.005
 """Resolution of the wrist's retreat: for fingers as asked for, and for fingers that stop."""
-_FINGER_SHARES = np.linspace(0.0, 1.0, 101)  # of the way to the pose, to see where a finger stops
+_FINGER_SHARES = np.linspace(0.0, 1.0, 51)  # of the way to the pose, to see where a finger stops
 _RETREAT_STEPS, _FINGER_STEPS, _HOLD_STEPS = 8, 25, 10  # control steps of 0.04 s
 _EXACT_M = 1e-9
 _TRIALS = 3  # poses that are tried in the simulation
@@ -110,10 +111,11 @@ def ablate(cfg: AblationCfg, start: StartState, scene: Scene, substeps: int) -> 
     The wrist's orientation stays, and so do pose and velocity of the object; the hand stands
     still. The distance is counted along the line on which the base's slides lead to the reset
     pose, straight in the world, and beyond it where that is nearer; the line ends where a slide
-    does. Where the hand would then cut into something, either the wrist goes further along the
-    line, or each finger stops where it meets something on its way from the pre-grasp; whichever
-    deviates less. Stopped fingers are moved there in the simulation with the object free, as a
-    proof that they get there without pushing it. Equal arguments give an equal result.
+    does. Where the hand would then cut into something deeper than the stored start does, either
+    the wrist goes further, back, up or away from the object, or each finger stops where it meets
+    something on its way from the pre-grasp; whichever deviates less. Stopped fingers are moved
+    there in the simulation with the object free, as a proof that they get there without pushing
+    it. Equal arguments give an equal result.
 
     Args:
         cfg: what to take away.
@@ -134,7 +136,7 @@ def ablate(cfg: AblationCfg, start: StartState, scene: Scene, substeps: int) -> 
         return best
     stopped = ablation.stopped(best.deviation_m)
     if not stopped or ablation.starts_inside:
-        return min([best, *stopped], key=lambda one: one.deviation_m)
+        return stopped[0] if stopped else best
     sim = SimBatch(scene, 2, 1, substeps)
     tried = (ablation.moved(sim, one) for one in stopped[:_TRIALS])
     return next((one for one in tried if one is not None), best)
@@ -149,14 +151,12 @@ class _Ablation:
         self._allowed = self._contact.depths(start.qpos)  # m, of each finger and the rest
         self.starts_inside = float(self._allowed.max()) > OBJECT_TOLERANCE_M
         """Whether the start cuts into something so far that a simulation would push it away."""
-        slides, (low, high) = start.qpos[:3], scene.model.jnt_range[:3].T
-        self._direction = -slides / max(float(np.linalg.norm(slides)), 1e-9)  # (3,) to the reset
-        moving = np.abs(self._direction) > 1e-9
-        ends = np.where(self._direction > 0, high, low) - slides
-        self._room = float((ends[moving] / self._direction[moving]).min()) if moving.any() else 0.0
-        nu, first = scene.model.nu, self._contact.first_finger_joint
-        self._fingers = slice(first, nu)
-        self._goal = self._finger_goal(nu - first)  # (J,) rad
+        self._fingers = slice(self._contact.first_finger_joint, scene.model.nu)
+        self._goal = self._finger_goal()  # (J,) rad
+        slides = start.qpos[:3]
+        back = _unit(-slides)  # to the reset pose, where all slides are zero
+        self._wrist = slides + min(cfg.distance_m, self._room(slides, back)) * back  # (3,) m
+        self._ways = [back, *self._up_and_away()]
 
     def found(
         self, qpos: np.ndarray, retreat: float, pushed: float = 0.0, simulated: bool = False
@@ -174,30 +174,36 @@ class _Ablation:
 
     def set_free(self) -> Ablated:
         """Return the pose as asked for, at the least retreat at which it cuts into nothing."""
-        span = max(self._room - self._cfg.distance_m, 0.0)
-        for retreat in np.arange(0.0, span + RETREAT_STEP_M, RETREAT_STEP_M):
-            qpos = self._pose(float(retreat), self._goal)
-            if self._is_free(qpos):
-                return self.found(qpos, float(retreat))
+        rooms = [self._room(self._wrist, way) for way in self._ways]
+        for retreat in np.arange(0.0, max(rooms) + RETREAT_STEP_M, RETREAT_STEP_M):
+            for way, room in zip(self._ways, rooms, strict=True):
+                qpos = self._pose(retreat * way, self._goal)
+                if retreat <= room and self._is_free(qpos):
+                    return self.found(qpos, float(retreat))
         raise SceneError(
             f"task '{self._scene.task.id}', ablation '{self._cfg.name}': the hand cuts into "
-            f"something all the way to the end of its slides, {self._room:.3f} m off"
+            "something wherever its slides take it"
         )
 
     def stopped(self, limit: float) -> list[Ablated]:
         """Return free poses whose fingers stop on their way, least deviation below limit first."""
-        poses = []
+        poses: list[Ablated] = []
         for retreat in np.arange(0.0, limit, SLOW_STEP_M):
-            qpos = self._advance(float(retreat))
-            if self._is_free(qpos):
-                poses.append(self.found(qpos, float(retreat)))
-        better = [pose for pose in poses if pose.deviation_m < limit]
-        return sorted(better, key=lambda pose: pose.deviation_m)
+            for way in self._ways if retreat > 0 else self._ways[:1]:
+                if retreat <= self._room(self._wrist, way):
+                    qpos = self._advance(retreat * way)
+                    if self._is_free(qpos):
+                        poses.append(self.found(qpos, float(retreat)))
+            poses = sorted((p for p in poses if p.deviation_m < limit), key=_deviation)
+            if poses and poses[0].deviation_m <= retreat + SLOW_STEP_M:
+                break
+        return poses
 
     def moved(self, sim: SimBatch, pose: Ablated) -> Ablated | None:
         """Return a pose once the simulation gets there, or None if it does not, or pushes.
 
-        The second simulation has the hand at its reset pose: there the object moves by itself.
+        A stored object may not lie still: in the second simulation, with the hand at its reset
+        pose, it goes where it goes by itself.
         """
         nu, goal = self._scene.model.nu, pose.start.qpos
         start, away = self._start.qpos[:nu], self._start.qpos[:nu].copy()
@@ -206,6 +212,7 @@ class _Ablation:
         alone[:nu] = 0.0
         sim.reset(np.array([0]), self._start.qpos, pose.start.qvel)
         sim.reset(np.array([1]), alone, pose.start.qvel)
+        stored = sim.read().object_pos[0]
         low, high = self._scene.model.actuator_ctrlrange.T
         targets = [
             *np.linspace(start, away, _RETREAT_STEPS + 1)[1:],
@@ -216,13 +223,14 @@ class _Ablation:
             if sim.step(np.stack((target, alone[:nu])).clip(low, high)).any():
                 return None
         state = sim.read()
-        pushed = float((state.object_pos[0] - state.object_pos[1]).norm())
+        object_pos, by_itself = state.object_pos
+        pushed = float(min((object_pos - stored).norm(), (object_pos - by_itself).norm()))
         off = np.abs(state.qpos[0].numpy() - goal)[self._fingers].max()
         if pushed > OBJECT_TOLERANCE_M or off > REACH_TOLERANCE_RAD:
             return None
         return self.found(goal, pose.retreat_m, pushed, simulated=True)
 
-    def _advance(self, retreat: float) -> np.ndarray:
+    def _advance(self, retreat: np.ndarray) -> np.ndarray:
         """Return qpos (nq,) after each finger went as far to its pose as nothing is met."""
         begin = self._start.qpos[self._fingers]
         fingers, done = begin.copy(), np.zeros(len(begin), bool)
@@ -238,24 +246,50 @@ class _Ablation:
         """Return whether no part of the hand is deeper in anything than in the stored start."""
         return bool((self._contact.depths(qpos) <= self._allowed + _EXACT_M).all())
 
-    def _pose(self, retreat: float, fingers: np.ndarray) -> np.ndarray:
-        """Return qpos (nq,) with the wrist as far away as asked for, and a retreat further."""
+    def _pose(self, retreat: np.ndarray, fingers: np.ndarray) -> np.ndarray:
+        """Return qpos (nq,) with the wrist as far away as asked for, and retreat (3,) m from it."""
         qpos = self._start.qpos.copy()
-        qpos[:3] += min(self._cfg.distance_m + retreat, self._room) * self._direction
+        qpos[:3] = self._wrist + retreat
         qpos[self._fingers] = fingers
         return qpos
 
-    def _finger_goal(self, count: int) -> np.ndarray:
+    def _room(self, slides: np.ndarray, way: np.ndarray) -> float:
+        """Return how far the slides go from a place (3,) along a unit direction (3,), m."""
+        low, high = self._scene.model.jnt_range[:3].T
+        moving = np.abs(way) > 1e-9
+        ends = (np.where(way > 0, high, low) - slides)[moving] / way[moving]
+        return max(0.0, float(ends.min())) if moving.any() else 0.0
+
+    def _up_and_away(self) -> list[np.ndarray]:
+        """Return the slides' directions, (3,) each, up and from the object to the hand."""
+        index = self._scene.index
+        data = mujoco.MjData(self._scene.model)
+        data.qpos[:] = self._start.qpos
+        mujoco.mj_kinematics(self._scene.model, data)
+        away = data.geom_xpos[index.point_geoms].mean(axis=0) - data.xipos[index.object_body]
+        mount = np.empty(9)
+        mujoco.mju_quat2Mat(mount, index.mount_quat)
+        return [_unit(world @ mount.reshape(3, 3)) for world in (np.array([0.0, 0, 1]), away)]
+
+    def _finger_goal(self) -> np.ndarray:
         """Return the finger joints (J,) asked for."""
         hand, ranges = self._scene.hand, self._scene.model.jnt_range[self._fingers]
         if self._cfg.fingers == "keep":
             return self._start.qpos[self._fingers]
         if self._cfg.fingers == "open":
-            return np.zeros(count).clip(*ranges.T)
-        if len(hand.mean_fingers_rad) != count:
+            return np.zeros(len(ranges)).clip(*ranges.T)
+        if len(hand.mean_fingers_rad) != len(ranges):
             raise ConfigError(
                 f"hand.mean_fingers_rad has {len(hand.mean_fingers_rad)} numbers, but hand "
-                f"'{hand.name}' has {count} finger joints after hand.num_base_joints and "
+                f"'{hand.name}' has {len(ranges)} finger joints after hand.num_base_joints and "
                 "hand.num_wrist_joints"
             )
         return np.array(hand.mean_fingers_rad).clip(*ranges.T)
+
+
+def _deviation(pose: Ablated) -> float:
+    return pose.deviation_m
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
