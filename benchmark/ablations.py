@@ -119,7 +119,7 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("tasks", nargs="*", default=available("task"), metavar="TASK")
     parser.add_argument("--csv", type=Path, default=RESULTS, help=f"[{RESULTS}]")
     arguments = parser.parse_args()
