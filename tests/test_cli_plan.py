@@ -75,7 +75,7 @@ def test_what_is_typed_is_planned(arguments: list[str], name: str, jobs: int) ->
     [
         ("validate_tcdm50", 150, 50_000_000),
         ("baselines_tcdm30", 240, 50_000_000),
-        ("ablations_tcdm30", 90, 50_000_000),
+        ("ablations_tcdm30", 450, 50_000_000),
         ("sim2real", 3, 50_000_000),
     ],
 )

@@ -110,7 +110,6 @@ def test_every_key_is_read_somewhere() -> None:
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
                 read.add(node.value)
                 read.add(node.value.rpartition(".")[2])
-    # Only a name so far: nothing is taken away before the ablations are there.
     unread = [key for key in all_fields() if key.rpartition(".")[2] not in read]
     assert unread == []
 

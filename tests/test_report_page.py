@@ -145,13 +145,17 @@ def test_table_one_and_baselines(page: Path) -> None:
 
 def test_ablations_stand_beside_the_papers(tmp_path: Path) -> None:
     make(tmp_path / "runs" / "a", 0.7, "task=cup-pour1")
-    make(tmp_path / "runs" / "b", 0.2, "task=cup-pour1", ablation={"name": "open_hand"})
+    for i, name in enumerate(("distance_15cm", "distance_25cm", "mean_hand", "open_hand")):
+        make(tmp_path / "runs" / name, 0.2 + i / 10, "task=cup-pour1", f"ablation={name}")
     text = text_of(report(tmp_path / "runs"))
     assert "Ablations" in text
     found = [r for r in rows("averages") if r["table"] == "ablation"]
     assert [(r["row"], r["success"], r["paper_success"]) for r in found] == [
         ("none", "0.7", "0.755"),
-        ("open_hand", "0.2", "0.231"),
+        ("distance_15cm", "0.2", "0.286"),
+        ("distance_25cm", "0.3", "0.197"),
+        ("mean_hand", "0.4", "0.595"),
+        ("open_hand", "0.5", "0.231"),
     ]
 
 

@@ -56,7 +56,8 @@ class RunResult:
 
 def env_builder(cfg: ExperimentCfg, library: Library) -> EnvBuilder:
     """Compile the task of an experiment."""
-    env = EnvCfg(cfg.task, cfg.hand, cfg.sim, cfg.pregrasp, cfg.obs, cfg.action, cfg.reference)
+    start = cfg.pregrasp, cfg.ablation
+    env = EnvCfg(cfg.task, cfg.hand, cfg.sim, *start, cfg.obs, cfg.action, cfg.reference)
     return EnvBuilder(library, env, recipe(cfg.method))
 
 

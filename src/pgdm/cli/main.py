@@ -127,15 +127,25 @@ def view(
         bool,
         typer.Option("--expert", help="Move the hand as a person's moved; spheres show contacts."),
     ] = False,
+    ablations: Annotated[
+        bool, typer.Option("--ablations", help="Show the start under each ablation instead.")
+    ] = False,
+    image: Annotated[
+        Path | None, typer.Option(help="With --ablations: write the pictures to this PNG.")
+    ] = None,
     offline: Annotated[bool, typer.Option("--offline", help="Never use the network.")] = False,
 ) -> None:
     """Replay a task's exemplar motion with the hand at its pre-grasp, or as a person moved it."""
+    from pgdm.cli.ablations import view_ablations
     from pgdm.cli.view import view_expert, view_task
 
+    if (ablations or image is not None) and (video is not None or expert or not ablations):
+        raise ConfigError("--ablations and --image FILE go together, without --video or --expert")
+    if ablations:
+        return view_ablations(task, image, pregrasp, offline)
     if expert:
-        view_expert(task, video, offline)
-    else:
-        view_task(task, video, pregrasp, offline)
+        return view_expert(task, video, offline)
+    return view_task(task, video, pregrasp, offline)
 
 
 @app.command("report")

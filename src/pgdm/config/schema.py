@@ -12,20 +12,13 @@ from pgdm.mdp.actions import KINDS, ActionCfg
 from pgdm.mdp.observations import LAYOUTS, ObsCfg
 from pgdm.methods import MethodCfg, config_class
 from pgdm.motion.reference import FRAMES, ReferenceCfg
+from pgdm.pregrasp.ablate import AblationCfg
 from pgdm.pregrasp.sources import SOURCES, PregraspCfg
 from pgdm.rl.checkpoint import CheckpointCfg
 from pgdm.rl.evaluate import EvalCfg
 from pgdm.rl.learner import PPOCfg, check_batch
 from pgdm.sim.scene import HandCfg, SimCfg, TaskCfg
 from pgdm.tracking import TRACKERS, TrackingCfg
-
-
-@dataclass(frozen=True)
-class AblationCfg:
-    """What is taken away from the method or its pre-grasp."""
-
-    name: str
-    """Name of the ablation; ``none`` takes nothing away."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +81,7 @@ class ExperimentCfg:
         _check_ranges(flat)
         self.method.validate()
         check_batch(self.algo, self.num_envs)
+        self.ablation.check(self.pregrasp.source)
         self._check_hand()
         self._check_placements()
         if self.device.partition(":")[0] not in ("cpu", "cuda"):
@@ -129,7 +123,6 @@ class ExperimentCfg:
 _CHOICES: dict[str, tuple[str, ...]] = {
     "pregrasp.source": SOURCES,
     "pregrasp.fallback": SOURCES,
-    "ablation.name": ("none",),
     "obs.layout": tuple(LAYOUTS),
     "action.kind": tuple(KINDS),
     "reference.frame": FRAMES,
@@ -145,6 +138,7 @@ _AT_LEAST: dict[str, int] = {
     "num_envs": 1,
     "num_threads": 0,
     "hand.num_base_joints": 0,
+    "hand.num_wrist_joints": 0,
     "action.lead_steps": 0,
     "action.residual_scale": 0,
     "algo.value_coef": 0,

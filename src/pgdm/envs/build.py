@@ -14,6 +14,7 @@ from pgdm.mdp.actions import ActionCfg, action_map
 from pgdm.mdp.observations import ObsCfg, layout
 from pgdm.mdp.recipe import Recipe
 from pgdm.motion.reference import FRAMES, ExpertReference, ObjectReference, ReferenceCfg
+from pgdm.pregrasp.ablate import AblationCfg, ablate
 from pgdm.pregrasp.sources import PregraspCfg, start_state
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.randomize import Randomizer
@@ -28,6 +29,7 @@ class EnvCfg:
     hand: HandCfg
     sim: SimCfg
     pregrasp: PregraspCfg
+    ablation: AblationCfg
     obs: ObsCfg
     action: ActionCfg
     reference: ReferenceCfg
@@ -45,7 +47,10 @@ class EnvBuilder:
         self.scene: Scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
         self.motion = library.motion(cfg.task.motion)
         self._wanted = cfg.pregrasp.source
-        start = start_state(cfg.pregrasp, self.motion, self.scene)
+        stored = start_state(cfg.pregrasp, self.motion, self.scene)
+        self.ablated = ablate(cfg.ablation, stored, self.scene, self.motion.substeps)
+        self._ablation = cfg.ablation.name
+        start = self.ablated.start
         index = self.scene.index
         reference = _reference(cfg.reference, ObjectReference.of(self.motion), self.scene)
         self.expert = _stored_expert(library, cfg) if recipe.needs_expert else None
@@ -82,6 +87,7 @@ class EnvBuilder:
             "motion_sha256": self.motion.sha256,
             "scene_sha256": self.scene.digest(),
             "pregrasp_used": self.mdp.start.source,
+            **self.ablated.facts(self._ablation),
         }
         return facts if self.expert is None else facts | {"expert_sha256": self.expert.sha256}
 

@@ -24,6 +24,9 @@ FILES = (
     "curves.csv",
 )
 
+ABLATION = ("ablation_distance_mm", "ablation_retreat_mm", "ablation_finger_error_rad")
+"""What a run tells of its ablated start; empty without an ablation."""
+
 Aggregates = dict[Setting, tuple[Estimate, list[Estimate], int, int]]
 Improvements = dict[tuple[Setting, Setting], tuple[Estimate, int]]
 
@@ -35,13 +38,18 @@ def runs(results: Results, out: Path) -> None:
         [
             *(run.task, results.labels[run.setting], run.seed, run.state),
             *("yes" if run.finished else "no", run.frames, run.setting.total_frames, run.budget),
-            *(run.start, run.result.get("wall_time_s", ""), run.result.get("git", "")),
+            run.start,
+            *(run.result.get(fact, "") for fact in ("wall_time_s", "git", *ABLATION)),
             *(run.metric(name) for name in METRICS),
             os.path.relpath(run.path, out.absolute()),
         ]
         for run in results.runs
     ]
-    _write(out / "runs.csv", [*head, "start", "wall_time_s", "git", *METRICS, "folder"], rows)
+    _write(
+        out / "runs.csv",
+        [*head, "start", "wall_time_s", "git", *ABLATION, *METRICS, "folder"],
+        rows,
+    )
 
 
 def tasks(results: Results, rows: Iterable[TaskRow], out: Path) -> None:

@@ -84,6 +84,10 @@ class HandCfg:
     """``all`` actuated joints are held against gravity, or only the ``base`` joints."""
     num_base_joints: int
     """Number of joints, first in qpos, that place the wrist."""
+    num_wrist_joints: int
+    """Number of joints after them that turn the palm; those that follow are the fingers'."""
+    mean_fingers_rad: list[float]
+    """Finger joints of the hand's mean pre-grasp, in the order of qpos, rad."""
     mount_body: str
     """Body that carries the base joints, child of the world."""
 

@@ -1,0 +1,137 @@
+"""How far ablated starts are from what the ablations ask for, over all tasks.
+
+    python benchmark/ablations.py [--csv FILE] [TASK ...]
+
+Needs a library with the tasks' assets; ``pregrasp=planned`` falls back to mined where no plan is
+stored. Prints a summary in Markdown, as on docs/ablations.md, and writes every start as CSV. The
+column ``residual_gap_m`` tells how far the fingertips stay from their places in the pre-grasp, on
+average, if an action of ``action=residual`` corrects the wrist as well as it can.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import statistics
+import time
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.minimize import least_squares
+
+from pgdm.config.groups import available
+from pgdm.config.store import compose
+from pgdm.experiment import env_builder
+from pgdm.library import open_library
+from pgdm.pregrasp.ablate import ablate
+from pgdm.pregrasp.sources import start_state
+from pgdm.sim.scene import Scene
+
+STARTS = ("planned", "mined")
+SCALE = compose(["action=residual"]).action.residual_scale
+RESULTS = Path(__file__).parent / "results" / "ablations.csv"
+
+
+def measure(task: str) -> list[dict[str, Any]]:
+    """Return a row for each start state and ablation of a task."""
+    rows = []
+    builder = env_builder(compose([f"task={task}"]), open_library())
+    for pregrasp in STARTS:
+        for ablation in available("ablation"):
+            # The task does not matter here, so that each choice is composed only once.
+            cfg = compose([f"pregrasp={pregrasp}", f"ablation={ablation}"])
+            stored = start_state(cfg.pregrasp, builder.motion, builder.scene)
+            began = time.process_time()
+            found = ablate(cfg.ablation, stored, builder.scene, builder.motion.substeps)
+            seconds = time.process_time() - began
+            figures = {k: v for k, v in dataclasses.asdict(found).items() if k != "start"}
+            gap = residual_gap(builder.scene, stored.qpos, found.start.qpos)
+            row = {"pregrasp": pregrasp, "ablation": ablation, "task": task, **figures}
+            row["residual_gap_m"] = gap
+            rows.append(row | {"seconds": seconds})
+    return rows
+
+
+def residual_gap(scene: Scene, stored: np.ndarray, ablated: np.ndarray) -> float:
+    """Return the fingertips' mean distance from their places after the best correction, m."""
+    model, index = scene.model, scene.index
+    data, base = mujoco.MjData(model), index.num_base_joints
+    tips = index.point_geoms[index.fingertips]
+
+    def places(qpos: np.ndarray) -> np.ndarray:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        return data.geom_xpos[tips].copy()
+
+    goal = places(stored)
+
+    def off(corrections: np.ndarray) -> np.ndarray:  # (base, k) -> (3F, k)
+        found = []
+        for correction in corrections.T:
+            qpos = ablated.copy()
+            qpos[:base] += correction
+            found.append((places(qpos) - goal).ravel())
+        return np.stack(found, axis=1)
+
+    reach = SCALE * 0.5 * (index.ctrl_high - index.ctrl_low)[:base]
+    best, _ = least_squares(np.zeros(base), off, bounds=[-reach, reach], verbose=0)
+    return float(np.linalg.norm(off(best[:, None]).reshape(-1, 3), axis=1).mean())
+
+
+def summary(rows: list[dict[str, Any]]) -> list[str]:
+    """Return the summary as a table in Markdown: largest values over the tasks."""
+    names = (
+        *("start", "ablation", "tasks", "simulated", "retreated", "retreat [mm]"),
+        *(
+            "distance [cm]",
+            "finger error [rad]",
+            "object pushed [mm]",
+            "penetration [mm]",
+            "time [s]",
+            "residual gap [cm]",
+        ),
+    )
+    table = ["| " + " | ".join(names) + " |", "|---" * len(names) + "|"]
+    key = itemgetter("pregrasp", "ablation")
+    for (pregrasp, ablation), group in groupby(sorted(rows, key=key), key):
+        some = list(group)
+
+        def most(name: str, some: list[dict[str, Any]] = some) -> float:
+            return max(row[name] for row in some)
+
+        least = min(row["distance_m"] for row in some)
+        cells = (
+            *(f"`{pregrasp}`", f"`{ablation}`", len(some), sum(row["simulated"] for row in some)),
+            *(sum(row["retreat_m"] > 0 for row in some), f"{1e3 * most('retreat_m'):.0f}"),
+            f"{1e2 * least:.1f}-{1e2 * most('distance_m'):.1f}",
+            *(f"{most('finger_error_rad'):.2f}", f"{1e3 * most('object_moved_m'):.1f}"),
+            *(f"{1e3 * most('depth_m'):.1f}", f"{most('seconds'):.2f}"),
+            f"{1e2 * statistics.median(row['residual_gap_m'] for row in some):.1f}",
+        )
+        table.append("| " + " | ".join(str(cell) for cell in cells) + " |")
+    return table
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("tasks", nargs="*", default=available("task"), metavar="TASK")
+    parser.add_argument("--csv", type=Path, default=RESULTS, help=f"[{RESULTS}]")
+    arguments = parser.parse_args()
+    rows = [row for task in arguments.tasks for row in measure(task)]
+    with arguments.csv.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, fieldnames=rows[0])
+        writer.writeheader()
+        for row in rows:
+            exact = {k: f"{v:.6f}" if isinstance(v, float) else v for k, v in row.items()}
+            writer.writerow(exact)
+    print("\n".join(summary(rows)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""``pgdm view TASK --ablations``: the start of an episode under each ablation, side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pgdm.cli.train import notify
+from pgdm.config.groups import available
+from pgdm.config.store import compose
+from pgdm.errors import ConfigError
+from pgdm.experiment import env_builder
+from pgdm.library import ensure
+from pgdm.pregrasp.ablate import FINGERS, Ablated, ablate
+from pgdm.pregrasp.sources import start_state
+
+
+def view_ablations(task: str, image: Path | None, pregrasp: str, offline: bool) -> None:
+    """Write the contact sheet of a task's ablated starts.
+
+    Raises:
+        PgdmError: if the task is unknown, its assets are missing, or nothing can be drawn.
+    """
+    if image is None or image.suffix.lower() != ".png":
+        given = f"not '{image}'" if image else "and none is given"
+        raise ConfigError(f"--ablations needs --image FILE that ends in .png, {given}")
+    cfg = compose([f"task={task}", f"pregrasp={pregrasp}"])
+    if cfg.pregrasp.source == "none":
+        raise ConfigError("--ablations with pregrasp none: without a pre-grasp nothing is ablated")
+    builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
+    for note in builder.notes:
+        notify(note)
+    scene, motion = builder.scene, builder.motion
+    from pgdm.sim.sheet import Panel, write_sheet
+
+    stored = start_state(cfg.pregrasp, motion, scene)
+    found = [compose([f"ablation={name}"]).ablation for name in available("ablation")]
+    found.sort(key=lambda a: (a.changes_start, a.distance_m, FINGERS.index(a.fingers)))
+    panels = []
+    for ablation in found:
+        ablated = ablate(ablation, stored, scene, motion.substeps)
+        title = f"{task}  {ablation.name}" if ablation.changes_start else f"{task}  {stored.source}"
+        panels.append(Panel(ablated.start.qpos, title, _figures(ablated)))
+        print(f"{ablation.name:16}{panels[-1].text}")
+    print(f"image: {write_sheet(scene, panels, image)}")
+
+
+def _figures(ablated: Ablated) -> str:
+    parts = [f"penetration {1e3 * ablated.depth_m:.1f} mm"]
+    if ablated.distance_m > 0:
+        parts.append(f"wrist {1e2 * ablated.distance_m:.1f} cm off")
+    if ablated.retreat_m > 0:
+        parts.append(f"of it {1e3 * ablated.retreat_m:.0f} mm retreat")
+    if ablated.finger_error_rad > 0:
+        parts.append(f"fingers stop {ablated.finger_error_rad:.2f} rad before")
+    return ", ".join(parts)

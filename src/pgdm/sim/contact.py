@@ -1,0 +1,57 @@
+"""How deep a hand is in other things."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from pgdm.sim.scene import Scene
+
+
+class HandContact:
+    """Tells what of a scene's hand cuts into other things: table, object, board, door.
+
+    Args:
+        scene: its actuated joints are the hand's, first in qpos.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        model, hand = scene.model, scene.hand
+        self._model, self._data = model, mujoco.MjData(model)
+        self.first_finger_joint = hand.num_base_joints + hand.num_wrist_joints
+        """Finger joints are those from here to nu."""
+        joints = model.jnt_bodyid[: model.nu]
+        of_hand = np.isin(model.body_rootid, model.body_rootid[joints])
+        self._of_hand = of_hand[model.geom_bodyid]
+        with_joint = set(joints[self.first_finger_joint :].tolist())
+        parents = model.body_parentid
+        root = np.full(model.nbody, -1)  # body at a finger's base, of each body in that finger
+        for body in range(1, model.nbody):  # parents come before their children
+            inherited = root[parents[body]]
+            root[body] = body if inherited < 0 and body in with_joint else inherited
+        bases = sorted(set(root[root >= 0].tolist()))
+        number = {-1: -1} | {base: i for i, base in enumerate(bases)}
+        finger = np.array([number[base] for base in root.tolist()])
+        self.num_fingers = len(bases)
+        self._finger_of_geom = finger[model.geom_bodyid]
+        self.finger_of_joint = finger[joints[self.first_finger_joint :]]
+        """Number of the finger, from 0, of each finger joint."""
+
+    def depth(self, qpos: np.ndarray) -> float:
+        """Return the hand's deepest penetration at qpos (nq,), m; 0 if there is none."""
+        return float(self.depths(qpos).max())
+
+    def depths(self, qpos: np.ndarray) -> np.ndarray:
+        """Return the deepest penetration of each finger, then of all else of the hand, (F+1,) m."""
+        model, data = self._model, self._data
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        depths = np.zeros(self.num_fingers + 1)
+        pairs = data.contact.geom[data.contact.dist < 0]
+        for (one, two), dist in zip(pairs, data.contact.dist[data.contact.dist < 0], strict=True):
+            if self._of_hand[one] != self._of_hand[two]:
+                finger = self._finger_of_geom[one if self._of_hand[one] else two]
+                depths[finger] = max(depths[finger], -dist)
+        return depths
