@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 CACHE = Path(tempfile.gettempdir()) / f"pgdm-tests-{os.getuid()}"
+DOWNLOADS = CACHE / "downloads"
 MISSING = CACHE / f"missing-{os.getpid()}"
 CHECKOUT: Path | None = None
 if os.environ.get("PGDM_TCDM_ROOT"):
@@ -47,6 +48,30 @@ def _filled_home(checkout: Path) -> Path:
     return home
 
 
+def _expert_home(checkout: Path) -> Path:
+    """Return a ``PGDM_HOME`` with the checkout and the expert trajectories of the package."""
+    from pgdm.errors import LibraryError
+    from pgdm.library import experts, package_index, registry
+    from pgdm.library.report import silent
+
+    filled = _filled_home(checkout)
+    home = filled.with_name(filled.name.replace("home-", "experts-"))
+    if not home.is_dir():
+        try:
+            archive = package_index.fetch(registry.PACKAGE, DOWNLOADS, False, silent)
+        except LibraryError as error:
+            pytest.skip(f"no package index: {error}")
+        fresh = Path(tempfile.mkdtemp(dir=CACHE, prefix="filling-"))
+        (fresh / "library").mkdir()
+        (fresh / "library" / "checkout").symlink_to(filled / "library" / "checkout")
+        experts.fill(fresh / "library", registry.PACKAGE, archive)
+        try:
+            fresh.rename(home)
+        except OSError:  # another worker was first
+            shutil.rmtree(fresh)
+    return home
+
+
 @pytest.fixture(scope="session")
 def library_home() -> Path:
     """Return a ``PGDM_HOME`` with all tasks of the checkout, and have ``PGDM_HOME`` name it.
@@ -58,14 +83,27 @@ def library_home() -> Path:
     return _filled_home(CHECKOUT)
 
 
+@pytest.fixture(scope="session")
+def expert_home() -> Path:
+    """Return a ``PGDM_HOME`` with the checkout's tasks and the expert hand trajectories.
+
+    ``PGDM_HOME`` names it; it is shared by all tests: copy it before changing anything.
+    """
+    if CHECKOUT is None:
+        pytest.skip("needs a TCDM checkout: name one with PGDM_TCDM_ROOT")
+    return _expert_home(CHECKOUT)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Before a test's fixtures: ``PGDM_HOME`` is the filled one if it asks, else a missing one.
 
     A hook and not a fixture, so that it comes before fixtures of wider scope as well.
     """
-    wants_library = "library_home" in getattr(item, "fixturenames", ())
-    if CHECKOUT is not None and wants_library:
+    wanted = getattr(item, "fixturenames", ())
+    if CHECKOUT is not None and "expert_home" in wanted:
+        os.environ["PGDM_HOME"] = str(_expert_home(CHECKOUT))
+    elif CHECKOUT is not None and "library_home" in wanted:
         os.environ["PGDM_HOME"] = str(_filled_home(CHECKOUT))
     else:
         shutil.rmtree(MISSING, ignore_errors=True)

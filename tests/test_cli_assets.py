@@ -56,8 +56,8 @@ def test_list_shows_every_task_in_a_row(checkout: Path, capsys: pytest.CaptureFi
     code, out, _ = run(capsys, "list")
     assert code == 0
     lines = [line.split() for line in out.splitlines()]
-    assert lines[0] == ["task", "hand", "object", "steps", "sources", "starts"]
-    assert ["hammer-use1", "adroit", "hammer", "6", "checkout", "planned,", "mined"] in lines
+    assert lines[0] == ["task", "hand", "object", "steps", "sources", "starts", "expert"]
+    assert ["hammer-use1", "adroit", "hammer", "6", "checkout", "planned,", "mined", "-"] in lines
     assert "2 tasks in" in out
 
 

