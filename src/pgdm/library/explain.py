@@ -78,7 +78,10 @@ def explain_expert(library: Library, task: str) -> Iterator[str]:
         f"  leaves the joints' limits by up to {entry.beyond_limits_rad:.2f} rad and, at the base, "
         f"{entry.beyond_limits_m:.2f} m (clipped for methods)"
     )
-    yield f"  the hand touches the object at {entry.touching_frames} poses; of these, by finger:"
+    if entry.approximate:
+        yield f"  of {entry.steps} poses (the recording does not say when it touches), by finger:"
+    else:
+        yield f"  the hand touches the object at {entry.touching_frames} poses, of which by finger:"
     rows = zip(FINGERS, entry.contact_frames, entry.within_5mm, strict=True)
     yield "  " + "; ".join(f"{name} in contact {n}, within 5 mm {p:.0%}" for name, n, p in rows)
 

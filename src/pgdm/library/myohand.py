@@ -65,6 +65,11 @@ _KEPT = {
 }
 
 
+def file_name(task: str) -> str:
+    """Return the path of a task's recording in the package."""
+    return f"{_DATA}/MyoHand_{task.replace('-', '_')}.npz"
+
+
 @dataclass(frozen=True)
 class HandMotion:
     """How a hand and an object moved, N frames, world frame of the recording."""
@@ -107,7 +112,7 @@ class MyoHand:
         Raises:
             CorruptAssetError: it is missing, of a wrong shape, not finite, or no unit quaternion.
         """
-        path = self._folder / _DATA / f"MyoHand_{task.replace('-', '_')}.npz"
+        path = self._folder / file_name(task)
         arrays = safe_npz.read_npz(path)
         joints = numbers(arrays, "robot", path.name, (None, JOINTS))
         poses = numbers(arrays, "object", path.name, (len(joints), 7))

