@@ -94,7 +94,8 @@ def test_formulas_at_every_recorded_state(golden: tuple[BatchEnv, dict]) -> None
         sim.reset(np.array([0]), record["qpos"][k + 1], qvel)
         state = sim.read()
         t = torch.tensor([k + 1])
-        context = StepContext(state, t, horizon - 1, reference.pos[t], reference.quat[t], z0)
+        target = reference.pos[t], reference.quat[t]
+        context = StepContext(state, t, horizon - 1, *target, z0, sim.scene.index)
         reward = sum(float(r.weight * r.value(context)[0]) for r in mdp.recipe.rewards)
         # Velocities of the points come from a recorded qvel in float32, so they are looser.
         np.testing.assert_allclose(

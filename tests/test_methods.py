@@ -18,8 +18,9 @@ from pgdm.config.identity import default_run_dir, identity, identity_hash
 from pgdm.config.saved import load_config, save_config
 from pgdm.config.store import compose
 from pgdm.envs.batch_env import BatchEnv
-from pgdm.envs.build import EnvBuilder, EnvCfg
+from pgdm.envs.build import EnvBuilder
 from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.experiment import env_builder
 from pgdm.library import Expert, Library, open_library
 from pgdm.methods import METHODS, recipe
 from pgdm.tracking.run_log import RunLog
@@ -57,10 +58,9 @@ class MadeUp(Library):
 
 def build(*overrides: str) -> EnvBuilder:
     cfg = compose(["task=cup-pour1", *overrides])
-    env = EnvCfg(cfg.task, cfg.hand, cfg.sim, cfg.pregrasp, cfg.obs, cfg.action, cfg.reference)
     library = open_library()
     folders = {source: library.folder(source) for source in library.sources()}
-    return EnvBuilder(MadeUp(library.root, library.sources(), folders), env, recipe(cfg.method))
+    return env_builder(cfg, MadeUp(library.root, library.sources(), folders))
 
 
 def steps(env: BatchEnv, count: int) -> dict:
@@ -167,12 +167,13 @@ def test_the_expert_is_clipped_and_its_contacts_are_seen_from_the_centre_of_mass
 def test_measures_of_an_episode_are_means_over_the_steps_they_apply_to(library_home: Path) -> None:
     env = build("method=graff").make(1, 1)
     seen: dict[str, list[Tensor]] = {}
-    episode: dict[str, Tensor] = {}
-    while not episode:
+    ended = None
+    while ended is None:
         info = steps(env, 1)
+        ended = info["episodes"]
         for name, value in info["measures"].items():
             seen.setdefault(name, []).append(value)
-        episode = info["episodes"]
+    episode = ended.metrics()
     for name, values in seen.items():
         torch.testing.assert_close(episode[name], torch.cat(values).nanmean()[None])
     assert math.isnan(seen["contact_distance_m"][1].item())  # step 2: nothing is touched yet
@@ -187,9 +188,10 @@ def test_the_hand_ends_an_episode_after_its_grace_and_is_counted(library_home: P
     assert not any(steps(env, 1)["ends"]["hand_lost"].any() for _ in range(4))
     info = steps(env, 1)
     assert info["ends"]["hand_lost"].tolist() == [True, True]
-    assert info["episodes"]["end/hand_lost"].tolist() == [1.0, 1.0]
-    assert info["episodes"]["length"].tolist() == [5.0, 5.0]
-    assert "raw/imitation" in info["episodes"] and "term/imitation" in info["episodes"]
+    episodes = info["episodes"].metrics()
+    assert episodes["end/hand_lost"].tolist() == [1.0, 1.0]
+    assert episodes["length"].tolist() == [5.0, 5.0]
+    assert "raw/imitation" in episodes and "term/imitation" in episodes
 
 
 def test_states_go_on_to_the_bit(library_home: Path) -> None:

@@ -2,7 +2,7 @@
 
 The way the published trajectories were made: a robot hand without motors, each of its points tied
 to a point of a human hand whose bones were given the robot's lengths. With the object in its place
-the published joints come out to 0.07 rad and the points to 1.6 mm; `benchmark/retarget.py`.
+the published fingers come out to 0.06 rad and 1.8 mm at their tips; `benchmark/retarget.py`.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ class LimpHand:
             anchors[:] = 0.0
             if i == 0:
                 anchors[:3] = pulled.wrist_anchor_m
-        names = [self._model.joint(i).name for i in range(self._model.njnt)]
-        self._joints = sum(name.startswith(_HAND) for name in names)
+        bodies = [self._model.body(i).name for i in self._model.jnt_bodyid]
+        self._joints = sum(name.startswith(_HAND) for name in bodies)
         self.lengths = self._bone_lengths()
         """Lengths of the robot's bones, straight hand (P,) m."""
 
