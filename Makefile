@@ -53,7 +53,7 @@ run: setup
 	$(BIN)/pgdm-run +experiment=quickstart $(ARGS)
 
 test: dev
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 slow: dev
 	$(BIN)/python -m pytest -m slow $(ARGS)
