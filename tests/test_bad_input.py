@@ -78,6 +78,7 @@ def assert_helps(outcome: Outcome, *said: str, code: int | None = None) -> None:
         (["-m", "task=dhand,-dhand-*"], ["'task=dhand,-dhand-*' leaves nothing to run"]),
         (["-m", "seed=interval(0,1)"], ["has no end of values; list those to try"]),
         (["-m", "seed=0,1", "seeed=1"], ["unknown key 'seeed'; did you mean seed"]),
+        (["-m", "task=tcdm30", "seeed=1"], ["unknown key 'seeed'; did you mean seed"]),
         (["-m", "algo=ppo,pppo"], ["unknown algo 'pppo'; did you mean ppo"]),
         (["-m", "seed=0", "sweep.nmae=x"], ["unknown key 'sweep.nmae'; did you mean sweep.name"]),
         (["-m", "seed=0", "sweep.name=a/b"], ["sweep.name 'a/b' is no name for a folder"]),

@@ -238,11 +238,8 @@ def _explain_task(name: str, tasks: Sequence[str], config_dir: str | None) -> Co
 
 
 def _known_names(overrides: Sequence[str], config_dir: str | None) -> list[str]:
-    """Return all keys of the experiment with the options that were chosen, dotted, and all groups.
-
-    The keys of a method depend on which one it is.
-    """
-    known = groups(config_dir)
-    chosen = [o for o in overrides if o.partition("=")[0] in known and "," not in o]
+    """Return all keys of the experiment with the method that was chosen, dotted, and all groups."""
+    methods = [f"method={name}" for name in available("method", config_dir)]
+    chosen = [override for override in overrides if override in methods]
     plain: Any = OmegaConf.to_container(_composed(chosen, config_dir), resolve=False)
-    return sorted({*flatten(plain), *known})
+    return sorted({*flatten(plain), *groups(config_dir)})

@@ -70,7 +70,7 @@ def _value(hint: Any, value: object, path: str) -> Any:
     origin = typing.get_origin(hint)
     if origin is typing.Annotated:
         base, chosen = typing.get_args(hint)
-        return _value(base if value is None else chosen.of(base, value), value, path)
+        return _value(chosen.of(base, value), value, path)
     if origin in (types.UnionType, typing.Union):
         inner = [option for option in typing.get_args(hint) if option is not type(None)]
         return None if value is None else _value(inner[0], value, path)
