@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 from pgdm.cli.train import notify
 from pgdm.config.store import compose
 from pgdm.envs.film import film_expert, film_motion
@@ -13,7 +11,6 @@ from pgdm.errors import ConfigError
 from pgdm.experiment import env_builder
 from pgdm.library import ensure, ensure_expert
 from pgdm.library.expert_index import ExpertEntry
-from pgdm.motion.reference import ExpertReference, ObjectReference
 from pgdm.sim.replay import expert_marks, expert_qpos, motion_qpos
 
 _FAR_M = 0.01  # out of its limits by more than this the hand is not where methods have it
@@ -47,20 +44,17 @@ def view_expert(task: str, video: Path | None, offline: bool) -> None:
             missing, or nothing can be drawn.
     """
     _check(video)
-    cfg = compose([f"task={task}"])
+    # The recorded pose is that of the mesh's origin: only so the fingers lie where they lay.
+    cfg = compose([f"task={task}", "method=graff", "reference=com_corrected"])
     library = ensure_expert(cfg.task.motion, offline, notify)
     builder = env_builder(cfg, library)
-    scene, start = builder.scene, builder.mdp.start.qpos
-    stored = library.expert(cfg.task.motion)
+    scene, mdp, expert = builder.scene, builder.mdp, builder.expert
+    assert expert is not None and mdp.expert is not None  # the method needs one
     _warn(library.expert_entry(cfg.task.motion), task)
-    low, high = torch.from_numpy(scene.model.jnt_range[: scene.index.num_actuators].copy()).mT
-    com = torch.from_numpy(scene.model.body_ipos[scene.index.object_body].copy())
-    expert = ExpertReference.of(stored, low, high, com)
-    # The recorded pose is that of the mesh's origin: only so the fingers lie where they lay.
-    reference = ObjectReference.of(builder.motion).com_corrected(com)
+    reference = mdp.reference
     # As published, not clipped to the limits: what the person did, not what the robot can do.
-    qpos = expert_qpos(scene, start, reference, stored.qpos)
-    marks = expert_marks(reference, expert)
+    qpos = expert_qpos(scene, mdp.start.qpos, reference, expert.qpos)
+    marks = expert_marks(reference, mdp.expert)
     if video is None:
         from pgdm.sim.viewer import show_motion
 

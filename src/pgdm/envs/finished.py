@@ -24,9 +24,7 @@ class Finished:
     recipe: Recipe
     episodes: Episodes
     sums: Tensor  # (2, K, k) of each reward term over the episode: weighted, then raw
-    measured: (
-        Tensor  # (2, M, k) of each measure: sum over the steps in which it applies, their count
-    )
+    measured: Tensor  # (2, M, k) of each measure: sum over the steps it applies to, their number
     flags: Tensor  # (1 + E, k) bool: diverged, then each of the recipe's ends
 
     def metrics(self) -> dict[str, Tensor]:
