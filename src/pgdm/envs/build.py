@@ -136,8 +136,8 @@ def _stored_expert(library: Library, cfg: EnvCfg) -> Expert:
         raise ConfigError(
             f"this method compares with an expert, and there is none for the motion "
             f"'{cfg.task.motion}' of task '{cfg.task.id}'; tasks that have one: "
-            f"{', '.join(error.valid) or 'none in this library'}. Methods that need none: pgdm, "
-            "curriculum"
+            f"{', '.join(error.valid) or 'those of suite adroit40, once fetched'}. Methods that "
+            "need none: pgdm, curriculum"
         ) from error
 
 

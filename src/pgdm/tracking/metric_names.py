@@ -36,7 +36,9 @@ METRICS = (
     Metric(
         "hand_error_m", "both", "m", "mean distance of fingertips from the expert's, over the steps"
     ),
-    Metric("hand_error_rad", "both", "rad", "mean angle between finger joints and the expert's"),
+    Metric(
+        "hand_error_rad", "both", "rad", "mean angle of wrist and finger joints to the expert's"
+    ),
     Metric(
         "contact_distance_m",
         "both",
