@@ -27,6 +27,8 @@ from pgdm.tracking.run_log import FILE_NAME
 
 RESULTS = Path(__file__).parent / "results" / "study"
 FRAMES = 500_000
+# The curriculum's 4M frames of the paper's 50M, as the same share of these.
+RAMP = f"method.curriculum.ramp_frames={4_000_000 * FRAMES // 50_000_000}"
 TRAIN_POINTS = 40
 
 TASKS = suite("quick6")
@@ -51,7 +53,7 @@ SETTINGS = {
     "distance_25cm": (TASKS, (RESIDUAL, "ablation=distance_25cm")),
     "deepmimic": (EXPERTS, (RESIDUAL, "method=deepmimic")),
     "graff": (EXPERTS, (RESIDUAL, "method=graff")),
-    "curriculum": (TASKS, (RESIDUAL, "method=curriculum")),
+    "curriculum": (TASKS, (RESIDUAL, "method=curriculum", RAMP)),
     "pgdm-absolute": (TASKS, (ABSOLUTE,)),
     "no_pregrasp-absolute": (TASKS, (ABSOLUTE, "pregrasp=none")),
     "open_hand-absolute": (TASKS, (ABSOLUTE, "ablation=open_hand")),
