@@ -80,8 +80,8 @@ def collect(run: Path, job: Job) -> dict[str, Any] | None:
     }
 
 
-def _without_empty(curve: dict[str, list[float]]) -> dict[str, list[float]]:
-    return {name: values for name, values in curve.items() if any(v == v for v in values)}
+def _without_empty(curve: dict[str, list[float | None]]) -> dict[str, list[float | None]]:
+    return {name: v for name, v in curve.items() if any(one is not None for one in v)}
 
 
 def off_the_line(run: dict[str, Any]) -> float:
@@ -110,7 +110,8 @@ def _row(run: dict[str, Any]) -> str:
         ("end/hand_lost", 1, ".0%"),
     ):  # fmt: skip
         curve = run["eval"].get(f"eval_deterministic/{name}")
-        ends = [format(unit * v, form) for v in (curve[0], curve[-1])] if curve else []
+        first_last = (curve[0], curve[-1]) if curve else ()
+        ends = ["-" if v is None else format(unit * v, form) for v in first_last]
         cells.append(" to ".join(ends) or "-")
     cells.append(f"{off_the_line(run):.1e}" if WEIGHT in run["train"] else "-")
     return f"| {' | '.join(cells)} |\n"

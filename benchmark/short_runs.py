@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -60,16 +61,17 @@ def finished(run: Path) -> dict[str, Any] | None:
     return {key: value for key, value in result.items() if key != "video"}
 
 
-def curves(run: Path, kind: str, names: Sequence[str]) -> dict[str, list[float]]:
+def curves(run: Path, kind: str, names: Sequence[str]) -> dict[str, list[float | None]]:
     """Return metrics of a run over its records of a kind, rounded, beside their ``frames``.
 
     Args:
         run: its folder.
         kind: ``train`` or ``eval``.
-        names: metrics; NaN where one was not recorded.
+        names: metrics; None, which JSON has and NaN is not, where one was not recorded.
     """
     lines = [line for line in RunLog(run / "metrics.jsonl").read() if line["kind"] == kind]
-    found: dict[str, list[float]] = {"frames": [int(line["frames"]) for line in lines]}
+    found: dict[str, list[float | None]] = {"frames": [int(line["frames"]) for line in lines]}
     for name in names:
-        found[name] = [round(float(line.get(name, float("nan"))), 5) for line in lines]
+        values = [float(line.get(name, math.nan)) for line in lines]
+        found[name] = [None if math.isnan(v) else round(v, 5) for v in values]
     return found
