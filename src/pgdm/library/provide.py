@@ -158,7 +158,7 @@ def _fetch_experts(
     with staging.locked(root):
         if _decided(open_library(root), task):  # another process was first
             return
-        names = " and ".join(f"{p.name} {p.version}" for p in packages)
+        names = " and ".join(f"{p.name} {p.version}" for p in lacking or packages)
         size = sum(p.bytes for p in lacking) / 1e6
         way = f"fetching {names} ({size:.0f} MB, once)" if lacking else f"reading {names}"
         notes = [registry.LICENCE_NOTE, *([myohand.LICENCE_NOTE] if rebuilt else [])]

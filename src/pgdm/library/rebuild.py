@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,8 +39,7 @@ ones': the mean of five recordings, each within 7 mm of it."""
 _NEAR_M = 0.001
 """How far a recording's object may lie from the motion's; the four: 0.005 mm."""
 
-_PUBLISHED = "mj_envs/envs/tcdm/assets/tmp_data"
-_WANTED = re.compile(rf"{_PUBLISHED}/Adroit_[a-z]+_[a-z0-9_]+\.npz")
+_WANTED = re.compile(rf"{wheel_experts.FOLDER}/Adroit_[a-z]+_[a-z0-9_]+\.npz")
 
 
 @dataclass(frozen=True)
@@ -56,6 +55,8 @@ class _Pair:
 class Rebuilder:
     """Fits on all recordings that exist twice, and rebuilds trajectories with the result.
 
+    The same packages always give the same trajectories, on the same kind of machine.
+
     Args:
         library: holds motions, models of hand and objects.
         folder: where :func:`unpacked` put the packages' files.
@@ -66,7 +67,7 @@ class Rebuilder:
     """
 
     def __init__(self, library: Library, folder: Path, progress: Progress = silent) -> None:
-        self._library, self._published = library, folder / _PUBLISHED
+        self._library, self._published = library, folder / wheel_experts.FOLDER
         self._myohand = MyoHand(folder)
         self._pairs: dict[str, _Pair] = {}
         tasks = self._myohand.tasks()
@@ -95,13 +96,7 @@ class Rebuilder:
         """
         motion = self._library.motion(task)
         recorded = self._myohand.read(task)
-        frames, steps = len(recorded.points), len(motion.translation)
-        skipped = frames - wheel_experts.STORED_POSES.get(task, steps)
-        if skipped < 0:
-            raise CorruptAssetError(
-                f"MyoHand's recording of {task} has {frames} frames, fewer than the motion's"
-            )
-        rows = slice(skipped, skipped + steps)
+        rows = wheel_experts.aligned(len(recorded.points), task, motion, "MyoHand's recording")
         turns = human_hand.matrices(recorded.rotation)
         turn, shift = human_hand.rigid(
             recorded.position[rows],
@@ -119,10 +114,10 @@ class Rebuilder:
             qpos=qpos[rows],
             human_joints=human[rows],
             # The recording does not say; a finger's distance alone decides.
-            touching=np.ones(steps, dtype=bool),
+            touching=np.ones(len(motion.translation), dtype=bool),
             position=position[rows],
             rotation=rotation[rows],
-            skipped=skipped,
+            skipped=rows.start,
             shift=np.zeros(3),
             approximate=True,
         )
@@ -228,38 +223,3 @@ def unpacked(published: Path, recordings: Path, progress: Progress = silent) -> 
         for archive, wanted in ((published, _WANTED), (recordings, myohand.WANTED)):
             wheel.unpack(archive, folder, lambda n, w=wanted: bool(w.fullmatch(n)), progress)
         yield folder
-
-
-def rebuild(
-    library: Library,
-    published: Path,
-    recordings: Path,
-    progress: Progress = silent,
-    tasks: Sequence[str] = TASKS,
-) -> dict[str, Recording]:
-    """Rebuild the trajectories of some tasks.
-
-    The same packages always give the same trajectories, on the same kind of machine.
-
-    Args:
-        library: holds motions, models of hand and objects of these tasks.
-        published: wheel of the package with the published trajectories.
-        recordings: wheel of :data:`pgdm.library.myohand.PACKAGE`.
-        progress: told about files and tasks.
-        tasks: their ids, by default those whose published trajectory is empty.
-
-    Returns:
-        By task, its trajectory: row t belongs to the motion's pose t.
-
-    Raises:
-        CorruptAssetError: an archive, a model or a recording is damaged.
-        UnknownNameError: the library lacks one of the tasks.
-    """
-    with unpacked(published, recordings, progress) as folder:
-        rebuilder = Rebuilder(library, folder, progress)
-        found = {}
-        for i, task in enumerate(tasks):
-            progress("rebuild", i, len(tasks))
-            found[task] = rebuilder.rebuild(task)
-        progress("rebuild", len(tasks), len(tasks))
-    return found

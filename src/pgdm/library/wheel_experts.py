@@ -13,12 +13,15 @@ from pgdm.library import motion_file, safe_npz
 from pgdm.library.expert_file import HUMAN_JOINTS, JOINTS, flags
 from pgdm.library.motion_file import Motion, numbers
 
+FOLDER = "mj_envs/envs/tcdm/assets/tmp_data"
+"""Where the package has them."""
+
 STORED_POSES = {"alarmclock-lift": 40, "duck-lift": 38, "waterbottle-lift": 42}
 """Poses that TCDM stores of a motion where it uses fewer: a recording ends with the last of
 them."""
 
 SHIFTED = frozenset({"alarmclock-lift"})
-"""Tasks whose recording is displaced by a constant, (0.7, -10.1, -2.9) mm, which is taken out."""
+"""Tasks whose recording is displaced by a constant, (0.8, -10.1, -2.9) mm, which is taken out."""
 
 _NEAR_M, _NEAR_COS = 0.003, float(np.cos(0.01))
 """How far a recording's object may lie from the motion's, mean, and be turned (0.02 rad, as the
@@ -54,10 +57,31 @@ def file_name(task: str) -> str:
     return f"Adroit_{thing}_{numbered}.npz"
 
 
-def read(path: Path, task: str, motion: Motion) -> Recording:
-    """Read a recording and cut it to the task's motion.
+def aligned(frames: int, task: str, motion: Motion, label: str) -> slice:
+    """Return which frames of a recording belong to the motion's poses.
 
     Recording and motion end together: its first frames are the ones that the motion lacks.
+
+    Args:
+        frames: length of the recording.
+        task: a task id.
+        motion: its motion.
+        label: the recording's name, for messages.
+
+    Raises:
+        CorruptAssetError: the recording is too short.
+    """
+    steps = len(motion.translation)
+    stored = STORED_POSES.get(task, steps)
+    if frames < stored:
+        raise CorruptAssetError(
+            f"{label}: has {frames} frames, fewer than the {stored} poses of {task}"
+        )
+    return slice(frames - stored, frames - stored + steps)
+
+
+def read(path: Path, task: str, motion: Motion) -> Recording:
+    """Read a recording and cut it to the task's motion, as :func:`aligned` says.
 
     Args:
         path: the package's file, unpacked.
@@ -73,18 +97,13 @@ def read(path: Path, task: str, motion: Motion) -> Recording:
         raise CorruptAssetError(f"{label}: is empty in the package")
     arrays = safe_npz.read_npz(path)
     states = numbers(arrays, "s", label, (None, JOINTS + 6))
-    frames, steps = len(states), len(motion.translation)
+    frames = len(states)
     human = numbers(arrays, "human_joint_coords", label, (frames, HUMAN_JOINTS, 3))
     touching = flags(arrays, "human_obj_contact", label, (frames,))
     position = numbers(arrays, "object_translation", label, (frames, 3))
     rotation = numbers(arrays, "object_orientation", label, (frames, 4))
     motion_file.check_unit(rotation, "object_orientation", label)
-    skipped = frames - STORED_POSES.get(task, steps)
-    if skipped < 0:
-        raise CorruptAssetError(
-            f"{label}: has {frames} frames, fewer than the {frames - skipped} poses of {task}"
-        )
-    rows = slice(skipped, skipped + steps)
+    rows = aligned(frames, task, motion, label)
     away = motion.translation - position[rows]
     shift = away.mean(axis=0) if task in SHIFTED else np.zeros(3)
     distance = float(np.linalg.norm(away - shift, axis=1).mean())
@@ -102,7 +121,7 @@ def read(path: Path, task: str, motion: Motion) -> Recording:
         touching=touching[rows],
         position=position[rows],
         rotation=rotation[rows],
-        skipped=skipped,
+        skipped=rows.start,
         shift=shift,
         approximate=False,
     )
