@@ -126,7 +126,9 @@ def plot(found: Sequence[dict[str, Any]], tasks: Sequence[str], path: Path) -> N
         ("eval", "eval_deterministic/lifted", "lifted"),
     )
     names = list(dict.fromkeys(run["setting"] for run in found))
-    figure, axes = plt.subplots(len(panels), len(tasks), figsize=(4.2 * len(tasks), 9), sharex=True)
+    figure, axes = plt.subplots(
+        len(panels), len(tasks), figsize=(max(8, 4.2 * len(tasks)), 9), sharex=True
+    )
     axes = axes.reshape(len(panels), len(tasks))
     for column, task in enumerate(tasks):
         axes[0][column].set_title(task)
@@ -176,7 +178,11 @@ def main() -> None:
         f"# {len(found)} of {len(jobs)} runs of {options.frames:,} frames\n\n"
         f"`python benchmark/methods.py`\n\n{table(found)}"
     )
-    plot(found, options.tasks, options.out / "curves.png")
+    plot(
+        found,
+        [t for t in options.tasks if any(run["task"] == t for run in found)],
+        options.out / "curves.png",
+    )
     print(table(found))
 
 

@@ -23,13 +23,14 @@ from pathlib import Path
 
 from pgdm.config.suites import suite
 from pgdm.tracking.run_folder import CONFIG, RESULT, RunFolder, find_runs
-from pgdm.tracking.run_log import FILE_NAME
+from pgdm.tracking.run_log import FILE_NAME, RunLog, metrics_of
 
 RESULTS = Path(__file__).parent / "results" / "study"
 FRAMES = 500_000
 # The curriculum's 4M frames of the paper's 50M, as the same share of these.
 RAMP = f"method.curriculum.ramp_frames={4_000_000 * FRAMES // 50_000_000}"
 TRAIN_POINTS = 40
+TRAINED = ("train/return", "train/success", "train/lifted")
 
 TASKS = suite("quick6")
 EXPERTS = [task for task in TASKS if task in suite("adroit_experts")]
@@ -85,21 +86,17 @@ def store(found: RunFolder, target: Path) -> None:
     target.mkdir(parents=True, exist_ok=True)
     shutil.copy(found.path / CONFIG, target)
     (target / RESULT).write_text(json.dumps({**found.result, "video": None}, indent=1) + "\n")
-    records = found.log.thinned(TRAIN_POINTS)
-    kept = [
-        {k: v for k, v in record.items() if record["kind"] == "eval" or _of_curve(k)}
-        for record in records
-    ]
-    text = "".join(f"{json.dumps(_without_nan(record))}\n" for record in kept)
-    (target / FILE_NAME).write_text(text)
-
-
-def _of_curve(name: str) -> bool:
-    return "/" not in name or name in ("train/return", "train/success", "train/lifted")
-
-
-def _without_nan(record: dict) -> dict:
-    return {k: None if v != v else v for k, v in record.items()}
+    (target / FILE_NAME).unlink(missing_ok=True)
+    log = RunLog(target / FILE_NAME)
+    for record in found.log.thinned(TRAIN_POINTS):
+        metrics, kind = metrics_of(record), str(record["kind"])
+        log.append(
+            {k: v for k, v in metrics.items() if kind == "eval" or k in TRAINED},
+            frames=int(record["frames"]),
+            iteration=int(record["iteration"]),
+            time_s=float(record["time_s"]),
+            kind=kind,
+        )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

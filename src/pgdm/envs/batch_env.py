@@ -147,10 +147,7 @@ class BatchEnv:
         terms = self._weights * raw
         reward = terms.sum(0)
         terminated = torch.stack(tuple(ends.values())).any(0)
-        self._term_sums += torch.stack((terms, raw))
-        if measures:
-            values = torch.stack(tuple(measures.values()))
-            self._measured += torch.stack((values.nan_to_num(0.0), (~values.isnan()).double()))
+        self._remember(terms, raw, measures)
         self._pos[self._rows, self._t], self._quat[self._rows, self._t] = self._poses(
             state, diverged if some_diverged else None
         )
@@ -247,6 +244,13 @@ class BatchEnv:
             index=self.sim.scene.index,
             expert=self.mdp.expert,
         )
+
+    def _remember(self, terms: Tensor, raw: Tensor, measures: dict[str, Tensor]) -> None:
+        """Add a step's terms (K, N), weighted and raw, and its measures to the episodes' sums."""
+        self._term_sums += torch.stack((terms, raw))
+        if measures:
+            values = torch.stack(tuple(measures.values()))
+            self._measured += torch.stack((values.nan_to_num(0.0), (~values.isnan()).double()))
 
     def _poses(self, state: SimState, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the object's pose, of a diverged simulation its last sane one."""

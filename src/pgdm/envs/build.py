@@ -47,10 +47,11 @@ class EnvBuilder:
         self.scene: Scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
         self.motion = library.motion(cfg.task.motion)
         self._wanted = cfg.pregrasp.source
-        stored = start_state(cfg.pregrasp, self.motion, self.scene)
-        self.ablated = ablate(cfg.ablation, stored, self.scene, self.motion.substeps)
-        self._ablation = cfg.ablation.name
-        start = self.ablated.start
+        start = start_state(cfg.pregrasp, self.motion, self.scene)
+        self.ablated = None
+        if cfg.ablation.changes_start:
+            self.ablated = ablate(cfg.ablation, start, self.scene, self.motion.substeps)
+            start = self.ablated.start
         index = self.scene.index
         reference = _reference(cfg.reference, ObjectReference.of(self.motion), self.scene)
         self.expert = _stored_expert(library, cfg) if recipe.needs_expert else None
@@ -87,8 +88,9 @@ class EnvBuilder:
             "motion_sha256": self.motion.sha256,
             "scene_sha256": self.scene.digest(),
             "pregrasp_used": self.mdp.start.source,
-            **self.ablated.facts(self._ablation),
         }
+        if self.ablated is not None:
+            facts |= self.ablated.facts()
         return facts if self.expert is None else facts | {"expert_sha256": self.expert.sha256}
 
     def make(

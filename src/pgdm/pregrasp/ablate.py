@@ -93,10 +93,8 @@ class Ablated:
         """Retreat of the wrist, and the fingers' error at their tips."""
         return self.retreat_m + FINGER_LENGTH_M * self.finger_error_rad
 
-    def facts(self, ablation: str) -> dict[str, str]:
-        """Return what a run should tell of it; nothing if nothing was taken away."""
-        if ablation == "none":
-            return {}
+    def facts(self) -> dict[str, str]:
+        """Return what a run should tell of it."""
         return {
             "ablation_distance_mm": f"{1e3 * self.distance_m:.1f}",
             "ablation_retreat_mm": f"{1e3 * self.retreat_m:.1f}",
