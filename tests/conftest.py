@@ -10,9 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import settings
 
 if TYPE_CHECKING:
     from pgdm.library.package_index import Package
+
+# How long an example takes says how busy the machine is.
+settings.register_profile("pgdm", deadline=None)
+settings.load_profile("pgdm")
 
 CACHE = Path(tempfile.gettempdir()) / f"pgdm-tests-{os.getuid()}"
 DOWNLOADS = CACHE / "downloads"
@@ -124,5 +129,9 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run the test in a folder of its own, as ``runs/`` goes below the working directory."""
+    """Run the test in a folder of its own, as ``runs/`` goes below the working directory.
+
+    What it makes itself, such as a pre-grasp, goes there too.
+    """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PGDM_USER_DIR", str(tmp_path / "user"))

@@ -47,6 +47,11 @@ ALLOWED: dict[str, set[str]] = {
     "omegaconf": {"config.store", "sweep.expand", "sweep.planning", "cli", "hydra_plugins"},
     "mlflow": {"tracking", "report"},
     "submitit": {"sweep.slurm"},
+    "mink": {"pregrasp"},
+    "viser": {"pregrasp"},
+    "trimesh": {"library", "pregrasp"},
+    "coacd": {"library"},
+    "h5py": {"pregrasp"},
 }
 
 Sources = dict[str, str]  # "sim.batch" -> its source; the package's own __init__ is "pgdm"

@@ -30,6 +30,24 @@ def downloads() -> Path:
     return home() / "downloads"
 
 
+def user() -> Path:
+    """Return the folder of what people make themselves: settings, objects, motions, pre-grasps.
+
+    ``PGDM_USER_DIR``, by default ``pgdm`` in the user's configuration directory. Unlike a cache it
+    holds what nothing can bring back.
+    """
+    chosen = os.environ.get("PGDM_USER_DIR")
+    if chosen:
+        return Path(chosen).expanduser().absolute()
+    config = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
+    return Path(config).expanduser().absolute() / "pgdm"
+
+
+def user_conf() -> Path:
+    """Return the folder of the user's own settings, laid out as ``conf/``."""
+    return user() / "conf"
+
+
 def runs() -> Path:
     """Return the default folder of runs: ``runs`` under the working directory."""
     return Path.cwd() / "runs"

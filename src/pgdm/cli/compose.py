@@ -82,11 +82,16 @@ def compose_all(flags: Flags) -> Composed:
 @contextmanager
 def _hydra_command_line(flags: Flags) -> Iterator[None]:
     """Show Hydra a command line of its own, and have it raise errors instead of printing them."""
+    from pgdm.config.groups import own_folders
+    from pgdm.config.store import search_path
+
     overrides = flags.overrides
     if flags.multirun:
         from pgdm.sweep.expand import with_tasks_as_choices
 
         overrides = with_tasks_as_choices(overrides)
+    if not any(override.startswith("hydra.searchpath=") for override in overrides):
+        overrides = [*search_path(own_folders(None)), *overrides]
     argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = ["pgdm-run", *flags.hydras, *overrides]
     os.environ["HYDRA_FULL_ERROR"] = "1"

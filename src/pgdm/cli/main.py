@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from pgdm.cli import assets, dashboard, runs, sweep
+from pgdm.cli import assets, author, dashboard, pregrasp, runs, sweep
 from pgdm.cli.errors import USAGE, check_environment, guarded, report
 from pgdm.errors import ConfigError
 
@@ -25,6 +25,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(assets.app, name="assets")
+app.add_typer(pregrasp.app, name="pregrasp")
+app.add_typer(author.app, name="author")
 app.add_typer(runs.app, name="runs")
 app.add_typer(sweep.app, name="sweep")
 app.command("dashboard")(dashboard.dashboard)

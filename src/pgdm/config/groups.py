@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pgdm import paths
 from pgdm.errors import ConfigError, UnknownNameError
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -27,9 +28,17 @@ def conf_dir() -> Path:
 
 
 def folders(config_dir: str | Path | None) -> list[Path]:
-    """Return the folders of settings, the user's own one last."""
-    own = [conf_dir()]
-    return own if config_dir is None else [*own, Path(config_dir)]
+    """Return the folders of settings: pgdm's, then the user's own ones."""
+    return [conf_dir(), *own_folders(config_dir)]
+
+
+def own_folders(config_dir: str | Path | None) -> list[Path]:
+    """Return the user's folders of settings: the one named for this command, then the lasting one.
+
+    Hydra looks into them in this order.
+    """
+    lasting = [paths.user_conf()] if paths.user_conf().is_dir() else []
+    return lasting if config_dir is None else [Path(config_dir), *lasting]
 
 
 def groups(config_dir: str | Path | None = None) -> list[str]:

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import YAMLError
 
-from pgdm.config.groups import available, conf_dir, groups
+from pgdm.config.groups import available, conf_dir, folders, groups, own_folders
 from pgdm.config.strict import build, flatten
 from pgdm.config.suites import suite, suites
 from pgdm.errors import ConfigError, UnknownNameError
@@ -37,6 +37,7 @@ __all__ = [
     "explain",
     "from_dict_config",
     "groups",
+    "search_path",
 ]
 
 COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, ValueError)
@@ -112,8 +113,7 @@ def compose_plain(overrides: Sequence[str] = ()) -> dict[str, Any]:
 
 def _stamp(folder: str | None) -> int:
     """Return when the settings last changed, so that an edited file is read anew."""
-    folders = [conf_dir()] if folder is None else [conf_dir(), Path(folder)]
-    files = [path for one in folders for path in one.rglob("*.yaml")]
+    files = [path for one in folders(folder) for path in one.rglob("*.yaml")]
     return hash(tuple((str(path), path.stat().st_mtime_ns) for path in files))
 
 
@@ -124,7 +124,7 @@ def _typed(overrides: tuple[str, ...], folder: str | None, _stamp: int) -> Exper
 
 def _composed(overrides: Sequence[str], folder: str | None = None) -> DictConfig:
     check_overrides(overrides)
-    search = [] if folder is None else [f"hydra.searchpath=[{_quoted(f'file://{folder}')}]"]
+    search = search_path(own_folders(folder))
     try:
         with _LOCK, _own_hydra(), hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
             return hydra.compose("config", overrides=[*search, *overrides])
@@ -161,6 +161,12 @@ def _own_hydra() -> Iterator[None]:
         yield
     finally:
         GlobalHydra.instance().hydra = running
+
+
+def search_path(folders: Sequence[Path]) -> list[str]:
+    """Return the override that has Hydra look into folders after its own; none for no folders."""
+    places = ",".join(_quoted(f"file://{folder}") for folder in folders)
+    return [f"hydra.searchpath=[{places}]"] if folders else []
 
 
 def _quoted(text: str) -> str:

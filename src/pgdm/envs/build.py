@@ -89,6 +89,8 @@ class EnvBuilder:
             "scene_sha256": self.scene.digest(),
             "pregrasp_used": self.mdp.start.source,
         }
+        if self.mdp.start.sha256:
+            facts["pregrasp_sha256"] = self.mdp.start.sha256
         if self.ablated is not None:
             facts |= self.ablated.facts()
         return facts if self.expert is None else facts | {"expert_sha256": self.expert.sha256}

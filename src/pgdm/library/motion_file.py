@@ -77,7 +77,7 @@ def check(
     starts = {}
     for name in STARTS:
         if f"start_{name}_qpos" in arrays:
-            starts[name] = _start(arrays, name, label)
+            starts[name] = start(arrays, f"start_{name}", label)
     return translation, orientation, int(substeps), starts
 
 
@@ -95,14 +95,30 @@ def check_unit(quaternions: np.ndarray, key: str, label: str) -> None:
         )
 
 
-def _start(arrays: Mapping[str, Any], name: str, label: str) -> Start:
-    qpos = numbers(arrays, f"start_{name}_qpos", label, (None,))
+def start(arrays: Mapping[str, Any], prefix: str, label: str) -> Start:
+    """Return the start state whose arrays' names begin with a prefix.
+
+    Raises:
+        CorruptAssetError: an array is missing, has a wrong shape, or holds NaN.
+    """
+    qpos = numbers(arrays, f"{prefix}_qpos", label, (None,))
     # The scenes have only one-degree-of-freedom joints: as many velocities as positions.
-    qvel = numbers(arrays, f"start_{name}_qvel", label, (len(qpos),))
+    qvel = numbers(arrays, f"{prefix}_qvel", label, (len(qpos),))
     actions = None
-    if f"start_{name}_actions" in arrays:
-        actions = numbers(arrays, f"start_{name}_actions", label, (None, None))
+    if f"{prefix}_actions" in arrays:
+        actions = numbers(arrays, f"{prefix}_actions", label, (None, None))
     return Start(qpos, qvel, actions)
+
+
+def pack_start(start: Start, prefix: str) -> dict[str, np.ndarray]:
+    """Return the arrays of a start state, their names beginning with a prefix."""
+    arrays = {
+        f"{prefix}_qpos": np.asarray(start.qpos, np.float64),
+        f"{prefix}_qvel": np.asarray(start.qvel, np.float64),
+    }
+    if start.actions is not None:
+        arrays[f"{prefix}_actions"] = np.asarray(start.actions, np.float64)
+    return arrays
 
 
 def numbers(
@@ -141,10 +157,7 @@ def pack(
         "substeps": np.asarray(substeps, np.int64),
     }
     for name, start in starts.items():
-        arrays[f"start_{name}_qpos"] = np.asarray(start.qpos, np.float64)
-        arrays[f"start_{name}_qvel"] = np.asarray(start.qvel, np.float64)
-        if start.actions is not None:
-            arrays[f"start_{name}_actions"] = np.asarray(start.actions, np.float64)
+        arrays |= pack_start(start, f"start_{name}")
     return arrays
 
 

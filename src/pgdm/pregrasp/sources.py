@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pgdm.errors import ConfigError
-from pgdm.library import Motion
+from pgdm.library import Motion, pregrasp_file
 from pgdm.sim.scene import Scene
 
-SOURCES = ("planned", "mined", "learned", "none")
+SOURCES = ("planned", "mined", "mocap", "teleop", "labeled", "learned", "none")
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,10 @@ class PregraspCfg:
 
     source: str
     """``planned``: state after the reach planner moved the hand to its pre-grasp; ``mined``: the
-    pre-grasp as found, kinematic; ``learned``: as a mesh-conditioned model predicted it; ``none``:
-    the hand's reset pose, all joints zero."""
+    pre-grasp as found, kinematic; ``mocap``: from a human hand's joints, by inverse kinematics;
+    ``teleop``: cut from a demonstration; ``labeled``: posed by a person; ``learned``: as a
+    mesh-conditioned model predicted it; ``none``: the hand's reset pose, all joints zero. The
+    user's own pre-grasp of a source goes before one that is stored with the motion."""
     fallback: str | None
     """Source to take where this one is not stored for a task, or None: then it is an error. The
     asset library that the program fetches has no plans, only mined pre-grasps."""
@@ -33,40 +35,63 @@ class StartState:
     source: str  # where it came from, which may be the fallback
     qpos: np.ndarray  # (nq,) m, rad
     qvel: np.ndarray  # (nv,) m/s, rad/s
+    sha256: str = ""  # of the file, if it is the user's own
 
 
 def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
     """Return the start state of a task.
 
-    With ``none`` the object stands where the mined pre-grasp has it (SPEC 3).
+    With ``none`` the object stands where the stored pre-grasp has it (SPEC 3).
 
     Raises:
-        ConfigError: if the source is unknown, is not stored for this task, or does not fit the
-            scene's joints.
+        ConfigError: if the source is unknown, there is none for this task, or what there is does
+            not fit the scene's joints.
     """
     if cfg.source not in SOURCES:
         raise ConfigError(f"pregrasp.source '{cfg.source}' is unknown; valid: {', '.join(SOURCES)}")
-    stored = cfg.source in motion.starts or cfg.source == "none"
-    source = cfg.source if stored or cfg.fallback is None else cfg.fallback
-    wanted = "mined" if source == "none" else source
-    if wanted not in motion.starts:
+    if cfg.source == "none":
+        return _reset_pose(motion, scene)
+    for source in (cfg.source, cfg.fallback):
+        if source is not None and (found := _stored(source, motion, scene)) is not None:
+            return found
+    task, hand = scene.task.id, scene.hand.name
+    have = [*motion.starts, *pregrasp_file.own(task, hand)]
+    raise ConfigError(
+        f"task '{task}' has no stored start '{cfg.source}' in source '{motion.source}'; "
+        f"it has: {', '.join(sorted(set(have)))} (pregrasp=...). Stored plans come with a "
+        f"TCDM checkout: pgdm assets import PATH; 'pgdm pregrasp --help' lists how to make your own"
+    )
+
+
+def _stored(source: str, motion: Motion, scene: Scene) -> StartState | None:
+    """Return the user's own start of a source, else the one stored with the motion, else None."""
+    task, hand = scene.task.id, scene.hand.name
+    own = pregrasp_file.find(task, hand, source)
+    if own is not None:
+        return _fitting(StartState(source, own.start.qpos, own.start.qvel, own.sha256), scene)
+    if source not in motion.starts:
+        return None
+    start = motion.starts[source]
+    return _fitting(StartState(source, np.array(start.qpos), np.array(start.qvel)), scene)
+
+
+def _reset_pose(motion: Motion, scene: Scene) -> StartState:
+    if "mined" not in motion.starts:
+        raise ConfigError(f"motion '{motion.id}' does not store where its objects start")
+    # Only the objects' joints, last in qpos, are taken: the hand may be another than the stored
+    # start's.
+    stored, model = motion.starts["mined"].qpos, scene.model
+    objects = stored[len(stored) - (model.nq - model.nu) :]
+    qpos = np.concatenate((np.zeros(model.nu), objects))
+    return _fitting(StartState("none", qpos, np.zeros(model.nv)), scene)
+
+
+def _fitting(start: StartState, scene: Scene) -> StartState:
+    model = scene.model
+    if start.qpos.shape != (model.nq,) or start.qvel.shape != (model.nv,):
         raise ConfigError(
-            f"task '{scene.task.id}' has no stored start '{wanted}' in source '{motion.source}'; "
-            f"it has: {', '.join(sorted(motion.starts))} (pregrasp=...). Stored plans come with a "
-            f"TCDM checkout: pgdm assets import PATH"
-        )
-    start, model = motion.starts[wanted], scene.model
-    qpos, qvel = np.array(start.qpos), np.array(start.qvel)
-    if source == "none":
-        # Only the objects' joints, last in qpos, are taken: the hand may be another than the
-        # stored start's.
-        objects = qpos[len(qpos) - (model.nq - model.nu) :]
-        qpos = np.concatenate((np.zeros(model.nu), objects))
-        qvel = np.zeros(model.nv)
-    if qpos.shape != (model.nq,) or qvel.shape != (model.nv,):
-        raise ConfigError(
-            f"start '{wanted}' of motion '{motion.id}' has {qpos.size} positions and {qvel.size} "
-            f"velocities, the scene of '{scene.task.id}' with hand '{scene.hand.name}' has "
+            f"start '{start.source}' of task '{scene.task.id}' has {start.qpos.size} positions and "
+            f"{start.qvel.size} velocities, the scene with hand '{scene.hand.name}' has "
             f"{model.nq} and {model.nv}; pregrasp=none starts any hand from its reset pose"
         )
-    return StartState(source, qpos, qvel)
+    return start
