@@ -7,7 +7,7 @@ object and table as obstacles. The better one is taken.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import mink
@@ -33,6 +33,8 @@ _STEPS, _SETTLED = 200, 1e-5  # of the solver, and largest joint step at which i
 _DAMPING = 1e-6
 _HABIT_WEIGHT = 0.006  # per rad, beside points' 1 per m: five points do not fix 24 joints
 _FAR_M = 0.02  # from where on an obstacle is seen
+# How far fingertips open and the palm moves off, to see where the hand comes free.
+_OPENINGS_M = tuple((opening, lift) for lift in (0.0, 0.01) for opening in (0.006, 0.015, 0.03))
 _RETREATS_M = (0.1, 0.06)  # from where the hand comes to the object
 _DEPTH_COST = 20.0  # m of fingertip error that a metre of penetration counts as
 
@@ -63,7 +65,8 @@ class IkResult:
     @property
     def cost(self) -> float:
         """Error of the points plus penetration, m; for choosing between results."""
-        return self.points_error_m + _DEPTH_COST * self.depth_m
+        worst = float(self.fingertip_errors_m.max())
+        return self.points_error_m + 0.2 * worst + _DEPTH_COST * self.depth_m
 
 
 class _Points(mink.Task):
@@ -263,10 +266,12 @@ def solve_targets(
     straight = ik.result(ik.track(targets, begin), targets)
     if not free or straight.depth_m == 0.0:
         return straight
-    candidates = [straight]
+    poses = [*_opened(ik, targets, straight.qpos)]
     if start is None:
-        candidates += _from_afar(ik, targets, begin)
-    freed = [_freed(ik, candidate.qpos, targets, seed) for candidate in candidates]
+        poses += _from_afar(ik, targets, begin)
+    # The search is what takes time: it starts at the best two, and where a hand was before.
+    poses = sorted((ik.result(q, targets) for q in poses), key=lambda r: r.cost)
+    freed = [_freed(ik, one.qpos, targets, seed) for one in (*poses[:2], straight)]
     return min(freed, key=lambda result: result.cost)
 
 
@@ -280,7 +285,26 @@ def _freed(ik: HandIk, qpos: np.ndarray, targets: Targets, seed: int) -> IkResul
     return min(result, nearer, key=lambda r: r.cost)
 
 
-def _from_afar(ik: HandIk, targets: Targets, begin: np.ndarray) -> list[IkResult]:
+def _opened(ik: HandIk, targets: Targets, begin: np.ndarray) -> list[np.ndarray]:
+    """Return poses with the fingertips farther apart and the palm farther off, and what becomes of
+    the free ones when they close again around what is in the way."""
+    tips = targets.points[ik.shape.rows[:, 2]]
+    outward = tips - tips.mean(axis=0)
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    found = []
+    for opening, lift in _OPENINGS_M:
+        points = targets.points + lift * targets.palm[:, 2]
+        points[ik.shape.rows[:, 1]] += 0.5 * opening * outward
+        points[ik.shape.rows[:, 2]] += opening * outward
+        pose = ik.track(replace(targets, points=points), begin, steps=60)
+        if ik.contact.depth(pose) == 0.0:
+            found.append(ik.track(targets, pose, steps=40, avoid=True))
+            break  # those that follow are only farther off
+        found.append(pose)
+    return found
+
+
+def _from_afar(ik: HandIk, targets: Targets, begin: np.ndarray) -> list[np.ndarray]:
     """Return where the hand gets that comes from a distance, past object and table."""
     model, index = ik.scene.model, ik.scene.index
     data = mujoco.MjData(model)
@@ -297,5 +321,5 @@ def _from_afar(ik: HandIk, targets: Targets, begin: np.ndarray) -> list[IkResult
         )  # fmt: skip
         out = ik.track(far, begin, steps=40)
         if ik.contact.depth(out) == 0.0:
-            found.append(ik.result(ik.track(targets, out, steps=80, avoid=True), targets))
+            found.append(ik.track(targets, out, steps=80, avoid=True))
     return found

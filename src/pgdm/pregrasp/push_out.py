@@ -14,6 +14,7 @@ _SPREAD = 0.01, 0.08  # of the first samples: m of sliding, rad of turning joint
 _SAMPLES, _ELITE, _ROUNDS = 64, 8, 40
 _DEPTH_COST = 60.0  # m of fingertip error that a metre of summed penetration counts as
 _MOVE_COST = 1e-3  # m of fingertip error for moving all joints by their spread
+_FAR_M = 0.01  # from here on a fingertip's error counts more than in proportion
 _EXACT_M = 1e-9
 
 
@@ -54,7 +55,8 @@ def pushed_out(
         depth = float(contact.depths(data.qpos).sum())
         mujoco.mj_kinematics(model, data)
         away = np.linalg.norm(data.geom_xpos[geoms] - targets.points, axis=1)
-        error = float((weights * away).sum() / len(tips))
+        # Squared, so that no finger pays for all.
+        error = float((weights * away * (1.0 + away / _FAR_M)).sum() / len(tips))
         return depth, error + _DEPTH_COST * depth + _MOVE_COST * float(move @ move) / nu
 
     mean, spread = np.zeros(nu), np.ones(nu)
