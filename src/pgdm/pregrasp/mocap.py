@@ -37,6 +37,13 @@ class Retargeted:
     frame: int
     fingers: tuple[str, ...]
     """Human finger of each fingertip."""
+    measured: tuple[int, ...]
+    """Fingertips whose human finger was measured; the others count for nothing."""
+
+    @property
+    def errors_m(self) -> np.ndarray:
+        """Distances of the measured fingertips from their targets."""
+        return self.result.fingertip_errors_m[list(self.measured)]
 
     @property
     def unreachable(self) -> list[str]:
@@ -45,6 +52,7 @@ class Retargeted:
         said = [
             f"{self.fingers[i]} fingertip ends {1e3 * errors[i]:.0f} mm from its target"
             for i in self.result.unreached()
+            if i in self.measured
         ]
         slides = [name for name in self.result.at_limit if _is_slide(name)]
         if slides:
@@ -56,7 +64,7 @@ class Retargeted:
     @property
     def fit(self) -> str:
         """A phrase that tells how well the hand fits."""
-        errors = self.result.fingertip_errors_m
+        errors = self.errors_m
         return (
             f"fingertips {1e3 * errors.mean():.0f} mm from the human's in the mean, "
             f"{1e3 * errors.max():.0f} mm at most"
@@ -180,9 +188,9 @@ def retarget(
     ik = HandIk(scene)
     result = solve_hand(ik, recording.frames[frame], objects, seed=seed)
     pose = Start(result.qpos, np.zeros(scene.model.nv), None)
-    made = Retargeted(Pregrasp(pose, None, {}), result, frame, ik.shape.fingers)
-    pregrasp = Pregrasp(pose, None, _note(made, recording.origin))
-    return Retargeted(pregrasp, result, frame, ik.shape.fingers)
+    measured = tuple(ik.shape.measured(recording.frames[frame]))
+    made = Retargeted(Pregrasp(pose, None, {}), result, frame, ik.shape.fingers, measured)
+    return replace(made, pregrasp=Pregrasp(pose, None, _note(made, recording.origin)))
 
 
 def check(made: Retargeted, scene: Scene) -> None:
@@ -191,7 +199,7 @@ def check(made: Retargeted, scene: Scene) -> None:
     Raises:
         ConfigError: its fingertips are far from where they should be, or it cuts into something.
     """
-    errors, depth = made.result.fingertip_errors_m, made.result.depth_m
+    errors, depth = made.errors_m, made.result.depth_m
     if errors.mean() > FAR_M or depth > DEEP_M:
         raise ConfigError(
             f"hand '{scene.hand.name}' cannot take up task '{scene.task.id}': "

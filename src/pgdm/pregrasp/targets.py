@@ -16,7 +16,7 @@ ANCHORS = ("wrist", "pads")
 the published trajectories were made, or the pads of the fingers, for hands of another size."""
 
 LIKE_A_PERSON = 0.8, 1.35
-"""Hands of so many times the human hand's length are anchored at the wrist."""
+"""Hands of so many times the human hand's length count as of its size."""
 
 _PAD_WEIGHT = 1.0
 _WEIGHTS = {"wrist": (0.6, 0.6, 0.6, 1.0), "pads": (0.05, 0.05, 0.1, 1.0)}
@@ -100,11 +100,14 @@ class HandShape:
 
         Args:
             human: the hand to follow.
-            anchor: one of :data:`ANCHORS`; by default the wrist for a hand of human size.
+            anchor: one of :data:`ANCHORS`; by default the wrist, if all five fingers were
+                measured and the robot's hand has the human's size.
         """
         scale = self.span_m / human.span_m
         if anchor is None:
-            anchor = ANCHORS[not LIKE_A_PERSON[0] < scale < LIKE_A_PERSON[1]]
+            whole = len(human.own) == len(FINGERS)
+            near = LIKE_A_PERSON[0] < scale < LIKE_A_PERSON[1]
+            anchor = "wrist" if whole and near else "pads"
         if anchor not in ANCHORS:
             raise UnknownNameError("anchor", anchor, ANCHORS)
         names = [FINGERS.index(name) for name in self.fingers]
