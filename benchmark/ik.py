@@ -56,7 +56,7 @@ def measure(task: str, hand: str) -> dict[str, Any]:
     cfg = compose([f"task={task}", f"hand={hand}"])
     scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
     motion = library.motion(cfg.task.motion)
-    own = build_scene(library, cfg.task, own_hand(task), cfg.sim)
+    own = build_scene(library, cfg.task, own_hand(cfg, library), cfg.sim)
     recording = of_task(library, own, motion)
     begun = time.monotonic()
     made = retarget(scene, library, motion, recording)

@@ -75,19 +75,15 @@ def assets(cfg: ExperimentCfg, notify: Notify, progress: FetchProgress | None = 
     if recipe(cfg.method).needs_expert:
         with suppress(UnknownNameError):  # `env_builder` says which tasks have an expert
             library = ensure_expert(cfg.task.motion, cfg.offline, notify, progress=progress)
-    own = cfg.hand if cfg.hand.name == _own_hand(cfg, library) else own_hand(cfg.task.id)
-    wanted = Wanted(cfg.task, cfg.hand, own, cfg.sim, cfg.pregrasp.source)
+    wanted = Wanted(cfg.task, cfg.hand, own_hand(cfg, library), cfg.sim, cfg.pregrasp.source)
     ensure_start(library, wanted, cfg.offline, notify, progress or Spoken(notify), threads(cfg))
     return library
 
 
-def own_hand(task: str) -> HandCfg:
-    """Return the hand that a task comes with, whatever hand is to take it up."""
-    return compose([f"task={task}"]).hand
-
-
-def _own_hand(cfg: ExperimentCfg, library: Library) -> str:
-    return library.entry(cfg.task.motion).hand
+def own_hand(cfg: ExperimentCfg, library: Library) -> HandCfg:
+    """Return the hand whose joints the motion's stored starts are, whatever hand takes it up."""
+    name = library.entry(cfg.task.motion).hand
+    return cfg.hand if cfg.hand.name == name else compose([f"hand={name}"]).hand
 
 
 def threads(cfg: ExperimentCfg) -> int:

@@ -40,7 +40,7 @@ def mocap(
     library = ensure(cfg.task.motion, offline, notify)
     motion = library.motion(cfg.task.motion)
     scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
-    wanted = Wanted(cfg.task, cfg.hand, own_hand(task), cfg.sim, "mocap")
+    wanted = Wanted(cfg.task, cfg.hand, own_hand(cfg, library), cfg.sim, "mocap")
     with bars() as progress:
         if file is None:
             human = human_hand(library, wanted, motion, offline, notify)
