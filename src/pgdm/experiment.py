@@ -13,6 +13,7 @@ from typing import Any
 
 from pgdm.config.saved import check_run_dir, save_config
 from pgdm.config.schema import ExperimentCfg
+from pgdm.config.store import compose
 from pgdm.envs.build import EnvBuilder, EnvCfg
 from pgdm.envs.film import film_policy
 from pgdm.errors import PgdmError, RenderError, RunError, UnknownNameError
@@ -20,10 +21,12 @@ from pgdm.library import Library, ensure, ensure_expert
 from pgdm.library.provide import Spoken
 from pgdm.library.report import Progress as FetchProgress
 from pgdm.methods import recipe
+from pgdm.pregrasp.provide import Wanted, ensure_start
 from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.rl.evaluate import Evaluator
 from pgdm.rl.trainer import Extras, Outcome, Trainer, TrainerCfg
+from pgdm.sim.scene import HandCfg
 from pgdm.stop import stoppable
 from pgdm.tracking import RunFolder, open_tracker
 from pgdm.tracking.provenance import git_revision, versions
@@ -62,16 +65,25 @@ def env_builder(cfg: ExperimentCfg, library: Library) -> EnvBuilder:
 
 
 def assets(cfg: ExperimentCfg, notify: Notify, progress: FetchProgress | None = None) -> Library:
-    """Open the library with all that an experiment needs in it; fetches what is missing.
+    """Open the library with all that an experiment needs in it; fetches or makes what is missing.
 
     Raises:
         LibraryError: if something is missing and cannot be fetched.
+        ConfigError: if the start cannot be made for this hand.
     """
     library = ensure(cfg.task.motion, cfg.offline, notify, progress=progress)
     if recipe(cfg.method).needs_expert:
         with suppress(UnknownNameError):  # `env_builder` says which tasks have an expert
-            ensure_expert(cfg.task.motion, cfg.offline, notify, progress=progress)
+            library = ensure_expert(cfg.task.motion, cfg.offline, notify, progress=progress)
+    wanted = Wanted(cfg.task, cfg.hand, own_hand(cfg, library), cfg.sim, cfg.pregrasp.source)
+    ensure_start(library, wanted, cfg.offline, notify, progress or Spoken(notify), threads(cfg))
     return library
+
+
+def own_hand(cfg: ExperimentCfg, library: Library) -> HandCfg:
+    """Return the hand whose joints the motion's stored starts are, whatever hand takes it up."""
+    name = library.entry(cfg.task.motion).hand
+    return cfg.hand if cfg.hand.name == name else compose([f"hand={name}"]).hand
 
 
 def threads(cfg: ExperimentCfg) -> int:

@@ -8,7 +8,7 @@ from pgdm.cli.train import notify
 from pgdm.config.store import compose
 from pgdm.envs.film import film_expert, film_motion, film_reach
 from pgdm.errors import ConfigError
-from pgdm.experiment import env_builder
+from pgdm.experiment import assets, env_builder
 from pgdm.library import ensure, ensure_expert
 from pgdm.library.expert_index import ExpertEntry
 from pgdm.pregrasp.rollout import play
@@ -25,8 +25,8 @@ def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> No
         PgdmError: if the task is unknown, its assets are missing, or nothing can be drawn.
     """
     _check(video)
-    cfg = compose([f"task={task}", f"pregrasp={pregrasp}"])
-    builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
+    cfg = compose([f"task={task}", f"pregrasp={pregrasp}", f"offline={str(offline).lower()}"])
+    builder = env_builder(cfg, assets(cfg, notify))
     start, reference = builder.mdp.start, builder.mdp.reference
     for note in builder.notes:
         notify(note)
