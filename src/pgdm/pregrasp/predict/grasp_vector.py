@@ -11,6 +11,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import torch
+from mujoco.minimize import least_squares
 
 from pgdm import rotations
 from pgdm.sim.scene import Scene
@@ -71,7 +72,8 @@ class GraspFrame:
     def qpos(self, vector: np.ndarray, objects: np.ndarray) -> np.ndarray:
         """Return the scene's state (nq,) in which the hand is where a vector says.
 
-        Base and joints are clipped to their limits, so that the hand may end up elsewhere.
+        Where the base would leave its limits, base and wrist take the place within them whose
+        fingertips and palm are nearest; the fingers stay.
 
         Args:
             vector: (9+J,).
@@ -83,8 +85,25 @@ class GraspFrame:
         turn = rotation_of(vector[ROTATION])
         palm = vector[POSITION] + centre - turn @ self.anchor_m
         base = self.base_joints(palm + turn @ in_palm, turn @ palm_turn)
-        hand = np.concatenate((base, joints)).clip(self._low, self._high)
-        return np.concatenate((hand, objects[self._nu :]))
+        asked = np.concatenate((base, joints, objects[self._nu :]))
+        hand = asked[: self._nu].clip(self._low, self._high)
+        if (hand == asked[: self._nu]).all():
+            return asked
+        moving = slice(0, self._base + self.scene.hand.num_wrist_joints)
+
+        def away(columns: np.ndarray) -> np.ndarray:  # (moving, k) -> (3F+3, k)
+            found = []
+            for column in columns.T:
+                trial = asked.copy()
+                trial[moving] = column
+                found.append(self._points(trial) - wanted)
+            return np.stack(found, axis=1)
+
+        wanted = self._points(asked)  # kinematics knows no limits
+        bounds = [self._low[moving], self._high[moving]]
+        best, _ = least_squares(hand[moving], away, bounds=bounds, verbose=0)
+        asked[moving] = best.clip(*bounds)
+        return asked
 
     def base_joints(self, position: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """Return base joints (6,), m and rad, that bring the mount's body to a pose; not clipped.
@@ -124,6 +143,11 @@ class GraspFrame:
         turn = rotation_of(vector[ROTATION])
         joints = vector[JOINTS].clip(self._low[self._base :], self._high[self._base :])
         return vector[POSITION] + (self.fingertips_in_palm(joints) - self.anchor_m) @ turn.T
+
+    def _points(self, qpos: np.ndarray) -> np.ndarray:
+        """Return fingertips and palm at qpos (nq,), (3F+3,) m, world frame."""
+        data = self._at(qpos)
+        return np.concatenate((data.geom_xpos[self._tips].ravel(), data.xpos[self._palm]))
 
     def _mount_in_palm(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the pose of the mount's body in the palm's frame, (3,) m and (3, 3)."""

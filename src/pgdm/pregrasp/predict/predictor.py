@@ -109,6 +109,7 @@ def fit(
     frame: GraspFrame,
     left_out: Sequence[str] = (),
     progress: Progress | None = None,
+    penalties: Sequence[float] = PENALTIES,
 ) -> Predictor:
     """Fit a predictor.
 
@@ -116,7 +117,8 @@ def fit(
         examples: of one hand.
         frame: of that hand, in any scene.
         left_out: objects that were left out of the examples, to be remembered.
-        progress: told about held-out fits.
+        progress: told about penalties tried.
+        penalties: to choose from; infinity is the mean vector, whatever the object.
 
     Raises:
         ConfigError: there are examples of too few objects.
@@ -132,33 +134,32 @@ def fit(
     frame = GraspFrame(frame.scene, anchor)
     codes = np.stack([e.code for e in examples])
     vectors = np.stack([anchored(e.vector, anchor) for e in examples])
-    best: tuple[float, float, np.ndarray] | None = None
-    for i, penalty in enumerate((*PENALTIES, np.inf)):
+    found: dict[float, tuple[float, np.ndarray]] = {}  # penalty -> mean error, errors (n, D)
+    tried = list(dict.fromkeys((*penalties, np.inf)))
+    for i, penalty in enumerate(tried):
         predicted = np.empty_like(vectors)
         for held, rest in folds(examples):
             predicted[held] = _Ridge(codes[rest], vectors[rest], penalty).at(codes[held])
-        error = float(np.mean([off(frame, v, e) for v, e in zip(predicted, examples, strict=True)]))
+        away = [off(frame, v, e) for v, e in zip(predicted, examples, strict=True)]
+        found[penalty] = float(np.mean(away)), vectors - predicted
         if progress is not None:
-            progress(i + 1, len(PENALTIES) + 1)
-        if np.isinf(penalty):
-            mean_error = error
-        elif best is None or error < best[0]:
-            best = error, penalty, vectors - predicted
-    assert best is not None
-    ridge = _Ridge(codes, vectors, best[1])
+            progress(i + 1, len(tried))
+    best = min(penalties, key=lambda penalty: found[penalty][0])
+    error, errors = found[best]
+    ridge = _Ridge(codes, vectors, best)
     return Predictor(
         hand=frame.scene.hand.name,
         anchor_m=anchor,
         code_mean=ridge.code_mean,
         slope=ridge.slope,
         mean=ridge.mean,
-        factor=SPREAD * best[2] / np.sqrt(max(len(examples) - 1, 1)),
-        penalty=best[1],
+        factor=SPREAD * errors / np.sqrt(max(len(examples) - 1, 1)),
+        penalty=best,
         tasks=tuple(sorted({e.task for e in examples})),
         objects=tuple(objects),
         left_out=tuple(left_out),
-        error_m=best[0],
-        mean_hand_error_m=mean_error,
+        error_m=error,
+        mean_hand_error_m=found[np.inf][0],
     )
 
 
