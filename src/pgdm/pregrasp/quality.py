@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from pgdm import seeding
+from pgdm.errors import ConfigError
 from pgdm.library import Start
 from pgdm.pregrasp.flexion import Flexion
 from pgdm.sim.batch import SimBatch
@@ -22,8 +23,12 @@ FAR_M = 0.5
 
 LIFT_M = 0.02
 """How far the object's centre of mass must rise: as much as earns the reward's bonus (SPEC 1)."""
-CARRY_M = 0.2
+CARRY_M = 0.1
 """How far the palm is carried up, or as far as its slides go."""
+PRESS_M = 0.03
+"""How far a policy moves the palm along its own direction while it closes, at most."""
+_SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # deviation of the wrist, and of joints that do not close
+_PRESS_STEPS = 8
 _CLOSE_STEPS, _LIFT_STEPS, _HOLD_STEPS = 20, 25, 15  # control steps
 _FASTEST, _SLOWEST = 4, 16  # steps in which a finger closes
 _GRIP, _FINGER, _JOINT = (0.3, 1.0), (0.5, 1.0), (0.7, 1.3)  # shares of the way to full flexion
@@ -49,8 +54,9 @@ class Quality:
 class LiftTest:
     """Closes the fingers in many random ways, carries the palm up, and looks at the object.
 
-    A policy closes each finger at a speed of its own by a random share of the way to full flexion,
-    then raises the wrist. Equal arguments give an equal result, whatever the number of threads.
+    A policy presses the palm a little towards where it looks, closes each finger at a speed of its
+    own by a random share of the way to full flexion, then raises the wrist. Equal arguments give
+    an equal result, whatever the number of threads.
 
     Args:
         scene: of the task.
@@ -69,6 +75,8 @@ class LiftTest:
         num_threads: int = 0,
     ) -> None:
         self._scene, self._flexion = scene, Flexion(scene)
+        self.made_for = scene.digest(), substeps
+        """Scene and speed that it tests."""
         self._sim = SimBatch(scene, num_policies, num_threads, substeps)
         self._all = np.arange(num_policies)
         fingers, n = self._flexion.num_fingers, num_policies
@@ -79,7 +87,11 @@ class LiftTest:
         self._steps = random.uniform(_FASTEST, _SLOWEST, (n, fingers))[:, of_joint]  # (N, J)
         mount = np.empty(9)
         mujoco.mju_quat2Mat(mount, scene.index.mount_quat)
-        self._carry = CARRY_M * mount.reshape(3, 3)[2]  # (3,) m, of the slides
+        self._mount = mount.reshape(3, 3)
+        self._carry = CARRY_M * self._mount[2]  # (3,) m, of the slides
+        self._press = random.uniform(0.0, PRESS_M, (n, 1))
+        self._shift = random.normal(0.0, _SHIFT_M, (n, 3))
+        self._spread = random.normal(0.0, _SPREAD_RAD, shares.shape)  # (N, J)
         self.possible = _can_rise(scene)
         """Whether the object can be lifted at all."""
 
@@ -94,14 +106,14 @@ class LiftTest:
         height = float(sim.read().object_pos[0, 2])
         begin = start.qpos[: index.num_actuators]
         closed = self._flexion.closed
-        way = np.where(np.isnan(closed), 0.0, closed - begin[first:])
+        shift = self._press * (self._flexion.palm(start.qpos)[1] @ self._mount) + self._shift
+        way = np.where(np.isnan(closed), self._spread, (closed - begin[first:]) * self._shares)
         targets = np.repeat(begin[None], len(self._all), 0)
         failed, held = np.zeros(len(self._all), bool), np.ones(len(self._all), bool)
         for k in range(1, _CLOSE_STEPS + _LIFT_STEPS + _HOLD_STEPS + 1):
-            targets[:, first:] = begin[first:] + way * self._shares * (k / self._steps).clip(max=1)
-            targets[:, :3] = begin[:3] + self._carry * np.clip(
-                (k - _CLOSE_STEPS) / _LIFT_STEPS, 0.0, 1.0
-            )
+            targets[:, first:] = begin[first:] + way * (k / self._steps).clip(max=1.0)
+            up = min(max((k - _CLOSE_STEPS) / _LIFT_STEPS, 0.0), 1.0)
+            targets[:, :3] = begin[:3] + min(k / _PRESS_STEPS, 1.0) * shift + up * self._carry
             failed |= sim.step(targets.clip(index.ctrl_low, index.ctrl_high))
             if k > _CLOSE_STEPS + _LIFT_STEPS:
                 held &= sim.read().object_pos[:, 2].numpy() >= height + LIFT_M
@@ -116,8 +128,15 @@ def quality(scene: Scene, qpos: np.ndarray, substeps: int, lift: LiftTest | None
         qpos: whole scene (nq,) with the hand at its pre-grasp.
         substeps: physics steps per control step.
         lift: test of this scene, or None to leave it out, as it takes a second.
+
+    Raises:
+        ConfigError: if the test was made for another scene or speed.
     """
-    del substeps  # the test has its own
+    if lift is not None and lift.made_for != (scene.digest(), substeps):
+        raise ConfigError(
+            f"this lift test was made for another scene or speed than that of task "
+            f"'{scene.task.id}' with hand '{scene.hand.name}' and {substeps} substeps"
+        )
     depth = HandContact(scene).depth(qpos)
     centre, normal = Flexion(scene).palm(qpos)
     data = mujoco.MjData(scene.model)

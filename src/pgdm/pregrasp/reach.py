@@ -63,7 +63,7 @@ class ReachCfg:
     """It ends as well once all is as it must be and this many rounds brought nothing better."""
 
 
-REACH = ReachCfg(None, 8, CemCfg(48, 8, 0.3), 40, 0.5, 0.8, 3)
+REACH = ReachCfg(None, 8, CemCfg(48, 8, 0.3), 40, 0.5, 0.5, 3)
 """The search as it is done for every task."""
 
 
