@@ -33,8 +33,8 @@ from pgdm.sim.sheet import Panel, write_sheet
 RESULTS = Path(__file__).parent / "results" / "predictor"
 HAND = "adroit"
 BEST_OF = (1, 8, 32)
-CANDIDATES = 6
-CHOOSING, JUDGING = 16, 32  # policies of the lift test
+CANDIDATES = 4
+CHOOSING, JUDGING = 12, 16  # policies of the lift test
 CHOOSING_SEED, JUDGING_SEED = 0, 1  # not judged by what it was chosen with
 SHOWN = ("mug-drink3", "hammer-use1", "wineglass-drink2", "duck-lift")
 

@@ -21,7 +21,7 @@ Progress = Callable[[int, int], None]
 """Told how many steps of how many are done."""
 
 OVERSAMPLING = 3
-"""Samples for each candidate: those are tested that had to be moved least to touch nothing."""
+"""Samples for each candidate that is lift-tested."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def propose(
         progress: told about samples.
 
     Returns:
-        At most ``count``, least moved first; the hand's quality without its lift rate.
+        At most ``count``, most promising first; the hand's quality without its lift rate.
 
     Raises:
         ConfigError: the predictor is of another hand, or the object hangs on something.
@@ -82,7 +82,10 @@ def free_ones(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[Candidate]:
-    """Return vectors as candidates that touch nothing, least moved first.
+    """Return vectors as candidates that touch nothing, most promising first.
+
+    Those are that had to be moved least and whose fingertips are near the object: a hand that
+    hovers far away touches nothing either.
 
     Raises:
         SceneError: none could be made free.
@@ -101,7 +104,7 @@ def free_ones(
             f"task '{scene.task.id}': none of {len(vectors)} predicted hands could be moved out of "
             "what it cuts into; try more samples, or another seed"
         )
-    return sorted(found, key=lambda c: c.moved_m)
+    return sorted(found, key=lambda c: c.moved_m + c.quality.fingertip_distance_m)
 
 
 def ranked(

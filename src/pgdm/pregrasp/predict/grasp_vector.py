@@ -61,7 +61,7 @@ class GraspFrame:
         return 9 + self._nu - self._base
 
     def vector(self, qpos: np.ndarray) -> np.ndarray:
-        """Return the vector (9+J,) of a scene's state qpos (nq,); joints clipped to their limits."""
+        """Return the vector (9+J,) of a state qpos (nq,), joints clipped to their limits."""
         data = self._at(qpos)
         palm = data.xmat[self._palm].reshape(3, 3)
         centre = data.xipos[self.scene.index.object_body]

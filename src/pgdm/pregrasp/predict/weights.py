@@ -64,10 +64,10 @@ def read(path: Path, hand: str) -> Predictor:
         raise ConfigError(f"{path}: is for hand '{content.get('hand')}', not '{hand}'; {cure}")
     try:
         arrays = {name: _array(content, name) for name in _ARRAYS}
-        numbers = {name: float(content[name]) for name in _NUMBERS}
-        names = {name: tuple(str(each) for each in content[name]) for name in _NAMES}
-    except (KeyError, TypeError, ValueError) as error:
-        raise CorruptAssetError(f"{path}: lacks or spoils {error}; {cure} anew") from error
+        penalty, error, mean_hand_error = (float(content[name]) for name in _NUMBERS)
+        tasks, objects, left_out = (tuple(map(str, content[name])) for name in _NAMES)
+    except (KeyError, TypeError, ValueError) as problem:
+        raise CorruptAssetError(f"{path}: lacks or spoils {problem}; {cure} anew") from problem
     size = len(arrays["mean"])
     wanted = {
         "anchor_m": (3,),
@@ -80,7 +80,16 @@ def read(path: Path, hand: str) -> Predictor:
             raise CorruptAssetError(
                 f"{path}: '{name}' has shape {arrays[name].shape}, not {shape}; {cure} anew"
             )
-    return Predictor(hand=hand, **arrays, **numbers, **names)
+    return Predictor(
+        hand=hand,
+        **arrays,
+        penalty=penalty,
+        tasks=tasks,
+        objects=objects,
+        left_out=left_out,
+        error_m=error,
+        mean_hand_error_m=mean_hand_error,
+    )
 
 
 def _array(content: dict[str, object], name: str) -> np.ndarray:
