@@ -19,7 +19,6 @@ INSIDE_RGB = (222, 45, 38)
 """Of links that cut into something."""
 _STILL = 1e-7  # m, and of a quaternion's parts: bodies that moved less are not sent again
 _ASPECT = 1.2  # of the part of the page that shows the scene
-_LAMP = (0.5, -0.6, 1.5)  # m, world frame
 _NEARER = 0.85  # than a film's camera: the forearm need not be seen
 _WRIST_SCALE, _TIP_SCALE = 0.11, 0.04  # m, of the handles
 
@@ -155,21 +154,9 @@ class Stage:
 
     def _lights(self) -> None:
         scene = self._scene_api
-        scene.configure_environment_map("studio", environment_intensity=0.3)
-        # Shadows of the default lights are made for rooms: a hand over a table has none.
-        scene.configure_default_lights(enabled=False)
-        scene.add_light_ambient("/lights/all", intensity=0.5)
-        scene.add_light_directional("/lights/side", intensity=0.6, position=(-1.0, -0.8, 0.5))
-        scene.add_light_spot(
-            "/lights/above",
-            position=_LAMP,
-            direction=(-_LAMP[0], -_LAMP[1], -_LAMP[2]),
-            angle=0.5,
-            penumbra=0.6,
-            decay=0.0,
-            intensity=2.4,
-            cast_shadow=True,
-        )
+        scene.configure_environment_map("studio", environment_intensity=0.25)
+        # The page's shadows are made for rooms: a hand over a table casts none, but they cost.
+        scene.configure_default_lights(cast_shadow=False)
         scene.world_axes.visible = False
 
     def _frame(self, body: int) -> str:
