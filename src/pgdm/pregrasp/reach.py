@@ -35,10 +35,11 @@ the last number: D'Manus."""
 _END_STD = 0.003, 0.02, 0.03
 """Deviation of the last targets of slides, m, hinges and fingers, rad, in the first round."""
 _END_LIMIT = 5.0  # tolerances that the last targets may be away from the goal
+_SETTLE_STEPS, _SETTLE_GAIN = 25, 0.3  # control steps in the air, in which servos are tried
 _SLACK = 0.4  # share of the tolerance within which a remaining error is not corrected
 _SPEED_WEIGHT_S = 0.05  # of the joints' mean final speed, in tolerances a second
 _CHECKED = 4  # candidates of a round that are looked at for penetration
-_IMPROVED = 0.98  # of the cost that was best: more is no progress
+_IMPROVED = 0.95  # of the cost that was best: more is no progress
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,10 @@ class _Search:
             scene, self._goal.joints, self._goal.qpos, steps, cfg.hold_steps, dt
         )
         mean, std = self._paths.prior(_END_STD)
+        extra = self._rollouts.settled_error(self._paths.above, _SETTLE_STEPS, _SETTLE_GAIN)
+        limit = _END_LIMIT * self._goal.tolerance
+        first_finger = scene.index.num_base_joints
+        mean[self._paths.layout.ends][first_finger:] = extra.clip(-limit, limit)[first_finger:]
         self._cem = CrossEntropy(mean, std, cfg.cem, seeding.numpy_stream(seed, "reach"))
         self._best: _Candidate | None = None
         self._rounds = self._idle = 0

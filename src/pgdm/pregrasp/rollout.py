@@ -139,6 +139,23 @@ class Rollouts:
             quat.append(state.object_quat[0].numpy())
         return ObjectTrack(np.stack(pos), np.stack(quat))
 
+    def settled_error(self, joints: np.ndarray, steps: int, gain: float) -> np.ndarray:
+        """Return what servos need beyond their goal to bring the hand to joints (nu,), (nu,).
+
+        Held there for a while, the targets follow what is lacking, as an integrator would.
+        """
+        index = self._scene.index
+        sim, nu = SimBatch(self._scene, 1, 1, self._substeps), len(joints)
+        sim.reset(np.array([0]), self._start, np.zeros(self._scene.model.nv))
+        extra = np.zeros(nu)
+        for k in range(2 * steps):
+            targets = (joints + extra).clip(index.ctrl_low, index.ctrl_high)
+            if sim.step(targets[None]).any():
+                return np.zeros(nu)
+            if k >= steps:
+                extra += gain * (joints - sim.read().qpos[0, :nu].numpy())
+        return extra
+
     def run(self, actions: np.ndarray, reference: ObjectTrack) -> Ends:
         """Return where plans (N, K, nu) end, the object compared with a reference."""
         sim, n = self._sim, len(self._all)

@@ -98,6 +98,13 @@ class Waypoints:
         std[layout.ends][base:] = fingers
         return mean, std
 
+    @property
+    def above(self) -> np.ndarray:
+        """Joints (nu,) of the pre-grasp's hand above it, or as far up as its slides go."""
+        joints = self._goal.copy()
+        joints[:3] += ABOVE_M * self._up
+        return joints.clip(self._low, self._high)
+
     def targets(self, candidates: np.ndarray) -> np.ndarray:
         """Return actuator targets (N, K, nu) of candidates (N, D), m and rad."""
         layout, base, n = self.layout, self._base, len(candidates)
