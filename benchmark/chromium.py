@@ -51,6 +51,7 @@ class Tab:
             mobile=False,
         )
         self("Page.enable")
+        self("Emulation.setFocusEmulationEnabled", enabled=True)  # also behind another tab
 
     def __call__(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Send a command and return its result."""
@@ -63,6 +64,11 @@ class Tab:
                 if "error" in answer:
                     raise RuntimeError(f"{method}: {answer['error']}")
                 return answer["result"]
+
+    def close(self) -> None:
+        """Close the page."""
+        self("Page.close")
+        self._socket.close()
 
     def open(self, url: str, until: str) -> None:
         """Open a page and wait until its text has some words."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from pgdm.pregrasp.labeler import names
 from pgdm.pregrasp.labeler.kinematics import Kinematics
+from pgdm.pregrasp.quality import FREE_M
 from pgdm.sim.scene import Scene
 
 FAR_M = 0.3
@@ -86,7 +87,7 @@ class FigureMaker:
         mujoco.mj_collision(self._model, data)
         deepest: dict[tuple[str, str], float] = {}
         links = set()
-        inside = data.contact.dist < 0
+        inside = data.contact.dist < -FREE_M
         for (one, two), dist in zip(
             data.contact.geom[inside], data.contact.dist[inside], strict=True
         ):

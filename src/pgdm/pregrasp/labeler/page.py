@@ -61,6 +61,15 @@ class LabelPage:
         """Address of the page."""
         return f"http://{guard.HOST}:{self.server.get_port()}"
 
+    @property
+    def idle(self) -> bool:
+        """Whether no trial runs."""
+        return self._trial is None
+
+    def save(self, anyway: bool = False) -> None:
+        """Have the pose saved, also one that touches something if it shall be so."""
+        self.mailbox.post(lambda: self._save(anyway))
+
     def close(self) -> None:
         """End the server; the pose that is not saved stays as a draft."""
         if self._trial is not None:
@@ -81,7 +90,7 @@ class LabelPage:
             reset=later(lambda: self._change(state.reset)),
             try_it=later(self._try_it),
             cancel=later(self._cancel),
-            save=lambda anyway: self.mailbox.post(lambda: self._save(anyway)),
+            save=self.save,
             handles=lambda which: self.mailbox.post(lambda: self.stage.show_handles(which)),
             solid=lambda shown: self.mailbox.post(lambda: self.stage.show_solid(shown)),
         )

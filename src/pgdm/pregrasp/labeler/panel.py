@@ -14,7 +14,7 @@ from pgdm.pregrasp.labeler.figures import FAR_M, Figures
 from pgdm.pregrasp.labeler.names import WRIST, Joint
 from pgdm.pregrasp.labeler.state import LabelState
 
-PAUSE_S = 0.7
+PAUSE_S = 1.0
 """A slider that rests for so long begins a new step of the history."""
 _ORDER = (WRIST, "Index", "Middle", "Ring", "Little", "Thumb")
 _STEP = 0.1  # of the sliders, mm and degrees

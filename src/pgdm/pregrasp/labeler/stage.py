@@ -67,10 +67,10 @@ class Stage:
             mesh = self._mesh(f"{self._frame(shape.body)}/solid", shape, 0.45)
             mesh.visible = False
             self._solid.append(mesh)
-        self._wrist = self._scene_api.add_transform_controls(
+        self.wrist = self._scene_api.add_transform_controls(
             "/handles/wrist", scale=_WRIST_SCALE, line_width=3.0, depth_test=False, opacity=0.85
         )
-        self._tips = [self._tip(finger.name) for finger in kinematics.fingers]
+        self.tips = [self._tip(finger.name) for finger in kinematics.fingers]
 
     def on_drag(self, wrist: OnWrist, tip: OnTip) -> None:
         """Have drags of the handles told, in their order."""
@@ -79,8 +79,8 @@ class Stage:
             handle = event.target
             wrist(np.array(handle.position), np.array(handle.wxyz), event.phase)
 
-        self._wrist.on_update(wrist_moved)
-        for finger, handle in enumerate(self._tips):
+        self.wrist.on_update(wrist_moved)
+        for finger, handle in enumerate(self.tips):
 
             async def tip_moved(event: viser.TransformControlsEvent, finger: int = finger) -> None:
                 tip(finger, np.array(event.target.position), event.phase)
@@ -122,9 +122,9 @@ class Stage:
         """
         pos, quat = self._kinematics.wrist_pose(qpos)
         if dragged != "wrist":
-            _place(self._wrist, pos, quat)
+            _place(self.wrist, pos, quat)
         data = self._kinematics.data
-        for finger, handle in enumerate(self._tips):
+        for finger, handle in enumerate(self.tips):
             if finger != dragged:
                 _place(handle, data.xpos[self._kinematics.fingers[finger].tip_body], None)
 
@@ -137,8 +137,8 @@ class Stage:
 
     def show_handles(self, which: str) -> None:
         """Show handles: ``all``, ``wrist``, ``fingertips`` or ``none``."""
-        self._wrist.visible = which in ("all", "wrist")
-        for handle in self._tips:
+        self.wrist.visible = which in ("all", "wrist")
+        for handle in self.tips:
             handle.visible = which in ("all", "fingertips")
 
     def show_solid(self, shown: bool) -> None:

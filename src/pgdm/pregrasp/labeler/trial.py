@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import threading
 import time
@@ -14,6 +15,7 @@ import numpy as np
 
 from pgdm.errors import PgdmError
 from pgdm.library.motion_file import Start
+from pgdm.pregrasp.quality import LiftTest, quality
 from pgdm.pregrasp.reach import ReachPlan, plan_reach, play, reset_pose
 from pgdm.sim.scene import Scene
 
@@ -96,11 +98,15 @@ class Trial:
         plan = plan_reach(
             scene, self._qpos, self._substeps, num_threads=self._threads, progress=progress
         )
+        self._told(PLAN_SHARE, "grasping and lifting")
+        start = plan.state if plan.reached else Start(self._qpos, np.zeros(scene.model.nv), None)
+        lift = LiftTest(scene, self._substeps, num_threads=self._threads)(start)
         self._check()
-        text = "; ".join(_reach_words(plan))
+        words = [_reach_words(plan), _lift_words(lift)]
+        note = {"reached": plan.reached, **_figures(plan, lift, self._palm_angle())}
+        text = "; ".join(words)
         self._told(1.0, text)
         self._play(plan)
-        note = {"reached": plan.reached, **_figures(plan)}
         return Outcome(plan.state if plan.reached else None, note), text
 
     def _play(self, plan: ReachPlan) -> None:
@@ -111,22 +117,33 @@ class Trial:
                 return
             time.sleep(dt)
 
+    def _palm_angle(self) -> float:
+        return quality(self._scene, self._qpos, self._substeps, None).palm_angle_rad
+
     def _check(self) -> None:
         if self._cancelled.is_set():
             raise _CancelError
 
 
-def _figures(plan: ReachPlan) -> dict[str, float]:
+def _figures(plan: ReachPlan, lift: float, palm_angle_rad: float) -> dict[str, float]:
     names = ("base_error_m", "base_error_rad", "finger_error_rad", "object_moved_m", "seconds")
-    return {f"reach_{name}": float(getattr(plan, name)) for name in names}
+    figures = {f"reach_{name}": float(getattr(plan, name)) for name in names}
+    figures["palm_angle_rad"] = palm_angle_rad
+    # A door has no lift rate, and JSON no NaN.
+    return figures if math.isnan(lift) else figures | {"lift_rate": lift}
 
 
-def _reach_words(plan: ReachPlan) -> list[str]:
-    """Return what a plan achieves."""
+def _reach_words(plan: ReachPlan) -> str:
     if not plan.reached:
-        return [f"the hand does not get there: {', '.join(plan.failures)}"]
+        return f"the hand does not get there: {', '.join(plan.failures)}"
     missed = max(plan.base_error_rad, plan.finger_error_rad)
-    return [
+    return (
         f"the hand gets there, to {1e3 * plan.base_error_m:.1f} mm and {missed:.2f} rad, and moves "
         f"the object by {1e3 * plan.object_moved_m:.1f} mm"
-    ]
+    )
+
+
+def _lift_words(lift: float) -> str:
+    if math.isnan(lift):
+        return "the object cannot be lifted"
+    return f"{lift:.0%} of random closing policies lift it"
