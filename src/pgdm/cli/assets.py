@@ -62,7 +62,7 @@ def fetch(
     print(LICENCE_NOTE)
     if experts:
         print(myohand.LICENCE_NOTE)
-    with _bars() as progress:
+    with bars() as progress:
         report = fetch_registry(paths.library(), offline, progress, rebuilt=experts)
     _say(report)
     index = open_library().experts()
@@ -81,7 +81,7 @@ def import_checkout(
     ] = False,
 ) -> None:
     """Import all tasks of a TCDM checkout (clone of facebookresearch/TCDM with submodules)."""
-    with _bars() as progress:
+    with bars() as progress:
         report = import_tcdm(path, paths.library(), progress, replace)
     _say(report)
 
@@ -123,7 +123,7 @@ def verify() -> None:
     if not files:
         print(f"the asset library in {paths.library()} is empty. {CURE}")
         raise typer.Exit(1)
-    with _bars() as progress:
+    with bars() as progress:
         found = damaged(library, progress)
     for line in found:
         print(line)
@@ -203,7 +203,7 @@ class _Bar:
 
 
 @contextmanager
-def _bars() -> Iterator[Progress]:
+def bars() -> Iterator[Progress]:
     """Give progress as bars with an estimate on a terminal, as plain lines elsewhere."""
     console = Console(stderr=True)
     if not console.is_terminal:

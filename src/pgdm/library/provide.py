@@ -13,15 +13,6 @@ from pgdm.library import figures, myohand, rebuild, registry, staging
 from pgdm.library.catalog import CURE, Library, open_library
 from pgdm.library.report import Progress
 
-_OTHER_TASKS = (
-    "dhand-alarmclock dhand-binoculars dhand-cup dhand-elephant dhand-waterbottle "
-    "dmanus-coffeecan dmanus-crackerbox dmanus-sim2real door-open hammer-strike "
-    "spheremedium-relocate"
-)
-OTHER_TASKS = tuple(_OTHER_TASKS.split())
-"""Tasks of the benchmark that only a TCDM checkout has."""
-
-
 _INTERVAL_S = 5.0
 _log = logging.getLogger(__name__)
 
@@ -78,13 +69,13 @@ def ensure(
         return library
     if task in figures.GRAB_TASKS:
         return _fetched(task, offline, notify, root, progress or Spoken(notify))
-    if task in OTHER_TASKS:
+    if task in figures.OTHER_TASKS:
         raise LibraryError(
             f"task '{task}' comes only from a TCDM checkout: clone facebookresearch/TCDM with its "
             "submodules, then run 'pgdm assets import PATH'"
         )
     raise UnknownNameError(
-        "task", task, [*library.tasks(), *figures.GRAB_TASKS, *OTHER_TASKS], CURE
+        "task", task, [*library.tasks(), *figures.GRAB_TASKS, *figures.OTHER_TASKS], CURE
     )
 
 

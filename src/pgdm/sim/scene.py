@@ -129,7 +129,7 @@ class Scene:
     task: TaskCfg
     hand: HandCfg
     asset_source: str
-    """The library's source that serves the task's assets."""
+    """The library's source that serves the task's assets, or its sources: ``own+checkout``."""
 
     def digest(self) -> str:
         """Return a SHA-256 over all that the physics depends on: equal scenes move equally."""
@@ -167,7 +167,9 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
         model = spec.compile()
     except ValueError as error:
         raise SceneError(f"the scene of task '{task.id}' does not compile: {error}") from error
-    return Scene(model, _index(model, task, hand, randomized), task, hand, source)
+    return Scene(
+        model, _index(model, task, hand, randomized), task, hand, library.origins(task.motion)
+    )
 
 
 def _load(file: Path) -> mujoco.MjSpec:
