@@ -1,15 +1,16 @@
 """Keyframes to a smooth motion of an object.
 
 Between two rests the positions are one quintic spline, and so are the rotation vectors from the
-first of the two orientations: smooth inside, and with no velocity and no acceleration at both ends.
-So the whole is twice continuously differentiable, begins and ends at rest, and passes through every
-keyframe. Two keyframes alone give the minimum-jerk profile, along a line and a great circle (slerp).
+first of the two orientations: smooth inside, with no velocity and no acceleration at both ends. So
+the whole is twice continuously differentiable, begins and ends at rest, and passes through every
+keyframe. Two keyframes alone give the minimum-jerk profile, along a line and by slerp.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,7 @@ def sample(keyframes: Sequence[Keyframe], times: np.ndarray) -> tuple[np.ndarray
     quat = np.array([k.quat for k in keyframes])
     rests = _rests(keyframes)
     out_pos, out_quat = np.empty((len(times), 3)), np.empty((len(times), 4))
-    for first, last in zip(rests[:-1], rests[1:], strict=True):
+    for first, last in pairwise(rests):
         span = slice(first, last + 1)
         here = (times >= key_times[first]) & (times <= key_times[last])
         out_pos[here] = _spline(key_times[span], pos[span], times[here])
@@ -117,7 +118,7 @@ def _rests(keyframes: Sequence[Keyframe]) -> list[int]:
     """Return which keyframes the object rests at, the first and the last among them."""
     same = [
         np.array_equal(a.pos, b.pos) and np.array_equal(a.quat, b.quat)
-        for a, b in zip(keyframes[:-1], keyframes[1:], strict=True)
+        for a, b in pairwise(keyframes)
     ]
     last = len(keyframes) - 1
     return [
@@ -218,7 +219,7 @@ def _check_times(keyframes: Sequence[Keyframe], label: str) -> None:
     times = [key.time_s for key in keyframes]
     if times[0] != 0.0:
         raise ConfigError(f"{label}: keyframe 0 has time_s {times[0]:g}; the first must be at 0")
-    for i, (one, two) in enumerate(zip(times[:-1], times[1:], strict=True)):
+    for i, (one, two) in enumerate(pairwise(times)):
         if not two - one >= _MIN_GAP_S - 1e-9:
             raise ConfigError(
                 f"{label}: keyframe {i + 1} at {two:g} s does not come {_MIN_GAP_S:g} s or more "

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pgdm.errors import LibraryError
 from pgdm.library.lowest import lowest
@@ -31,6 +32,8 @@ class Drop:
     qpos: np.ndarray  # (6,) its joints at the end, m and rad
     quat: np.ndarray  # (4,) wxyz, its orientation at the end
     com: np.ndarray  # (3,) m, its centre of mass at the end
+    turned_rad: float
+    """By how much it lies turned from how it was put."""
     sunk_m: float
     """Depth of its lowest point in the table at the end."""
     drift_m: float
@@ -39,19 +42,21 @@ class Drop:
     turn_rad_s: float
 
     @property
-    def tilt_rad(self) -> float:
-        """By how much it lies turned from how it was put."""
-        return 2.0 * float(np.arccos(min(1.0, abs(self.quat[0]))))
-
-    @property
     def rests(self) -> bool:
         """Whether it lies still on the table."""
         still = self.speed_m_s < REST_M_S and self.turn_rad_s < REST_RAD_S
         return still and self.sunk_m < SINK_M and self.drift_m < DRIFT_M
 
 
-def drop(object_xml: Path) -> Drop:
-    """Put an object a little above the table, as it stands in its own frame, and let it fall.
+def drop(
+    object_xml: Path, place: tuple[float, float] = (0.0, 0.0), turn: Rotation | None = None
+) -> Drop:
+    """Put an object a little above the table and let it fall.
+
+    Args:
+        object_xml: its model.
+        place: where its centre of mass begins, (x, y) m.
+        turn: its orientation; None is as it stands in its own frame.
 
     Raises:
         LibraryError: the simulation diverges.
@@ -64,6 +69,9 @@ def drop(object_xml: Path) -> Drop:
     model = spec.compile()
     data = mujoco.MjData(model)
     body = model.body("it/object").id
+    start = Rotation.identity() if turn is None else turn
+    data.qpos[3:] = start.as_euler("XYZ")
+    data.qpos[:2] = np.array(place) - start.apply(model.body_ipos[body])[:2]
     data.qpos[2] = HEIGHT_M - lowest(model, data, body)
     half = np.zeros(3)
     steps = round(TIME_S / model.opt.timestep)
@@ -81,9 +89,14 @@ def drop(object_xml: Path) -> Drop:
     return Drop(
         qpos=data.qpos.copy(),
         quat=data.xquat[body].copy(),
+        turned_rad=_turned(start, data.xquat[body]),
         com=end.copy(),
         sunk_m=max(0.0, -lowest(model, data, body)),
         drift_m=float(np.linalg.norm(end[:2] - half[:2])),
         speed_m_s=float(np.linalg.norm(velocity[3:])),
         turn_rad_s=float(np.linalg.norm(velocity[:3])),
     )
+
+
+def _turned(start: Rotation, quat: np.ndarray) -> float:
+    return float((start.inv() * Rotation.from_quat(quat, scalar_first=True)).magnitude())

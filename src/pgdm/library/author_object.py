@@ -87,10 +87,10 @@ class AuthoredObject:
 
 def drop_text(found: Drop) -> str:
     """Return in words how an object came to lie."""
-    if found.rests and found.tilt_rad < _UPRIGHT_RAD:
+    if found.rests and found.turned_rad < _UPRIGHT_RAD:
         return "rests as it was put"
     if found.rests:
-        return f"falls over and rests, turned by {np.rad2deg(found.tilt_rad):.0f} degrees"
+        return f"falls over and rests, turned by {np.rad2deg(found.turned_rad):.0f} degrees"
     return (
         f"does NOT rest: {100 * found.speed_m_s:.1f} cm/s after 4 s, went {100 * found.drift_m:.1f}"
         f" cm sideways in the last 2 s, {1e3 * found.sunk_m:.1f} mm deep in the table"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -43,6 +44,15 @@ class Library:
     def sources(self) -> dict[str, Manifest]:
         """Return the manifest of each source that is present, the winning one first."""
         return dict(self._sources)
+
+    def promising(self, task: str, entry: TaskEntry) -> Library:
+        """Return this library as it is once a task of the user's is in it, to build its scene."""
+        empty = Manifest(source=staging.OWN, origin="", imported_at="")
+        own = self._sources.get(staging.OWN, empty)
+        grown = dataclasses.replace(own, tasks={**own.tasks, task: entry})
+        place = self._folders.get(staging.OWN, paths.user() / "library")
+        folders = {**self._folders, staging.OWN: place}
+        return Library(self.root, {**self._sources, staging.OWN: grown}, folders)
 
     def folder(self, source: str) -> Path:
         """Return the folder of a source that is present."""

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from pgdm.errors import ConfigError
 from pgdm.library.animate import STEP_S, continuous
 from pgdm.library.lowest import lowest
+from pgdm.library.pose_file import resampled
 
 # The fastest of the benchmark's 50 motions have 2.2 m/s, 44 m/s2 (a bottle that is shaken) and
 # 16 rad/s: what the hands' servos can follow at all.
@@ -80,8 +81,8 @@ def check_motion(poses: Poses, label: str) -> None:
         )
     if fast[0] > START_SPEED_M_S or turning[0] > START_TURN_RAD_S:
         raise ConfigError(
-            f"{label}: is on its way in its first step ({fast[0]:.2g} m/s, {turning[0]:.2g} rad/s); "
-            "a motion starts at rest: --smooth adds a beginning"
+            f"{label}: moves in its first step already, {fast[0]:.2g} m/s and "
+            f"{turning[0]:.2g} rad/s; a motion starts at rest: --smooth adds a beginning"
         )
 
 
@@ -106,8 +107,6 @@ def slower(poses: Poses, factor: float) -> Poses:
     Raises:
         ConfigError: the factor is no slowing.
     """
-    from pgdm.library.pose_file import resampled
-
     if not 1.0 <= factor <= 20.0:
         raise ConfigError(f"--slower is {factor:g}; valid: 1 to 20")
     rows = np.concatenate((poses.pos, poses.quat), axis=1)

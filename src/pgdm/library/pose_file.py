@@ -79,7 +79,7 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
     if bad := _first(~np.isfinite(rows).all(axis=1)):
         raise CorruptAssetError(f"{label}: row {bad - 1} has a NaN or infinite value")
     norms = np.linalg.norm(rows[:, 3:], axis=1)
-    off = np.abs(norms - 1.0)
+    off: np.ndarray = np.abs(norms - 1.0)
     if bad := _first(off > _UNIT_LIMIT):
         raise CorruptAssetError(
             f"{label}: row {bad - 1} has a quaternion of norm {norms[bad - 1]:.4g}, not a unit one "
@@ -91,16 +91,16 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
     if times is None:
         return PoseFile(pos, quat, repairs)
     _check_times(times, len(rows), label)
-    times = times - times[0]
-    if np.allclose(np.diff(times), STEP_S, atol=1e-6):
+    elapsed: np.ndarray = np.asarray(times - times[0])
+    if np.allclose(np.diff(elapsed), STEP_S, atol=1e-6):
         return PoseFile(pos, quat, repairs)
-    wanted = STEP_S * np.arange(int(times[-1] / STEP_S + 1e-9) + 1)
+    wanted = STEP_S * np.arange(int(elapsed[-1] / STEP_S + 1e-9) + 1)
     repairs.append(
-        f"resampled {len(rows)} rows over {times[-1]:.2f} s to {len(wanted)}, {STEP_S:g} s apart"
+        f"resampled {len(rows)} rows over {elapsed[-1]:.2f} s to {len(wanted)}, {STEP_S:g} s apart"
     )
-    turns = Slerp(times, Rotation.from_quat(quat, scalar_first=True))(wanted)
+    turns = Slerp(elapsed, Rotation.from_quat(quat, scalar_first=True))(wanted)
     quat = continuous(turns.as_quat(scalar_first=True))
-    return PoseFile(np.asarray(CubicSpline(times, pos)(wanted)), quat, repairs)
+    return PoseFile(np.asarray(CubicSpline(elapsed, pos)(wanted)), quat, repairs)
 
 
 def _check_times(times: np.ndarray, count: int, label: str) -> None:
@@ -114,7 +114,7 @@ def _check_times(times: np.ndarray, count: int, label: str) -> None:
         raise CorruptAssetError(f"{label}: lasts {times[-1] - times[0]:g} s, not a control step")
 
 
-def _first(wrong: np.ndarray) -> int:
+def _first(wrong: Any) -> int:
     """Return the number of the first True, from 1; 0 if there is none."""
     return int(wrong.argmax()) + 1 if wrong.any() else 0
 
