@@ -74,9 +74,14 @@ def test_a_stop_and_equal_keyframes_are_rests() -> None:
     assert np.linalg.norm(np.diff(stopped, axis=0), axis=1).max() < 1e-8
 
 
-coordinate = st.floats(-0.3, 0.3)
+coordinate = st.integers(-300, 300).map(lambda mm: mm / 1000)
 poses = st.tuples(
-    st.floats(0.2, 1.0), coordinate, coordinate, coordinate, st.floats(-150, 150), st.booleans()
+    st.integers(5, 25).map(lambda k: 0.04 * k),
+    coordinate,
+    coordinate,
+    coordinate,
+    st.integers(-150, 150),
+    st.booleans(),
 )
 
 

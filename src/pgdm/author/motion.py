@@ -107,8 +107,8 @@ def _animated(path: Path, object_xml: Path, notes: list[str]) -> Poses:
     _check_rest(rest, str(path))
     if rest.turned_rad > NEAR_RAD:
         notes.append(
-            f"the object falls over when it is put so, by {np.rad2deg(rest.turned_rad):.0f} degrees;"
-            " the motion begins where it comes to rest"
+            f"the object falls over when it is put so, by {np.rad2deg(rest.turned_rad):.0f} "
+            "degrees; the motion begins where it comes to rest"
         )
     return Poses(*animation.at(rest.com, rest.quat))
 

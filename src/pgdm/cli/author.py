@@ -51,6 +51,75 @@ def make_object(
     print_object(ObjectRequest(mesh, name, factor, mass, density, cfg, licence, replace))
 
 
+@app.command("task")
+def make_task(
+    object_name: Annotated[
+        str, typer.Option("--object", metavar="NAME", help="Object, yours or the library's.")
+    ],
+    task: Annotated[
+        str, typer.Option("--id", metavar="ID", help="Id of the new task, such as gear-lift.")
+    ],
+    hand: Annotated[str, typer.Option(help="adroit, dhand or dmanus.")] = "adroit",
+    keyframes: Annotated[
+        Path | None, typer.Option(help="YAML file of keyframes.", metavar="FILE")
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="Recorded poses: .csv, .npz or .json.", metavar="FILE")
+    ] = None,
+    origin: Annotated[
+        str, typer.Option(help="What recorded positions are of: com, or mesh (its file's origin).")
+    ] = "com",
+    pregrasp: Annotated[
+        str,
+        typer.Option(
+            help="mean or open: search the hand near the object with such fingers; later: none "
+            "yet; a pre-grasp's .npz; or a task whose fingers are taken.",
+            metavar="WHICH",
+        ),
+    ] = "mean",
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Filter a motion, and have it start and end at rest.")
+    ] = False,
+    slower: Annotated[float, typer.Option(help="Play it slower by this factor.")] = 1.0,
+    lift_above_table: Annotated[
+        bool, typer.Option("--lift-above-table", help="Raise what lies in the table.")
+    ] = False,
+    settle: Annotated[
+        bool, typer.Option("--settle", help="Carry the motion to where the object rests.")
+    ] = False,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Make a task of that id anew.")
+    ] = False,
+    offline: Annotated[bool, typer.Option("--offline", help="Never use the network.")] = False,
+) -> None:
+    """Make a task from an object, a hand and a motion; pgdm-run task=ID then trains it."""
+    from pgdm.author import TaskRequest
+    from pgdm.author.motion import MotionRequest
+    from pgdm.cli.author_task import print_task
+
+    motion = MotionRequest(keyframes, poses, origin, smooth, slower, lift_above_table, settle)
+    print_task(TaskRequest(task, object_name, hand, motion, pregrasp, replace), offline)
+
+
+@app.command("list")
+def list_own() -> None:
+    """List the objects and tasks that you made."""
+    from pgdm.cli.author_list import print_own
+
+    print_own()
+
+
+@app.command("remove")
+def remove_own(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="An object or a task of yours.")],
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Remove an object or a task that you made; nothing brings it back."""
+    from pgdm.cli.author_list import remove
+
+    remove(name, yes)
+
+
 def _factor(scale: float | None, unit: str | None) -> float:
     """Return the metres in one unit of the file."""
     from pgdm.errors import ConfigError, UnknownNameError

@@ -1,9 +1,9 @@
 """Keyframes to a smooth motion of an object.
 
-Between two rests the positions are one quintic spline, and so are the rotation vectors from the
-first of the two orientations: smooth inside, with no velocity and no acceleration at both ends. So
-the whole is twice continuously differentiable, begins and ends at rest, and passes through every
-keyframe. Two keyframes alone give the minimum-jerk profile, along a line and by slerp.
+The positions are quintic pieces, and so are the rotation vectors from the last rest's orientation:
+with a speed chosen at each keyframe, none at rests, and no acceleration there. So the whole is
+twice continuously differentiable, begins and ends at rest, and passes through every keyframe. Two
+keyframes alone give the minimum-jerk profile, along a line and by slerp.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import BPoly, PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from pgdm.errors import ConfigError, UnknownNameError
@@ -28,7 +28,6 @@ FRAMES = ("rest", "world")
 _KEYS = ("frame", "place", "keyframes")
 _PLACE_KEYS = ("pos_m", "euler_deg", "quat")
 _KEYFRAME_KEYS = ("time_s", "pos_m", "euler_deg", "quat", "stop")
-_AT_REST = [(1, np.zeros(3)), (2, np.zeros(3))]  # velocity and acceleration at an end
 _MIN_GAP_S = STEP_S
 
 
@@ -129,9 +128,15 @@ def _rests(keyframes: Sequence[Keyframe]) -> list[int]:
 
 
 def _spline(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return the quintic spline through values (n, 3), at rest at both ends."""
-    spline = make_interp_spline(times, values, k=5, bc_type=(_AT_REST, _AT_REST))
-    return np.asarray(spline(wanted))
+    """Return the quintic curve through values (n, 3), at rest at both ends.
+
+    Inside, its slopes are those of a monotone interpolant: where a coordinate has its highest or
+    lowest keyframe it does not shoot over it.
+    """
+    slopes = PchipInterpolator(times, values).derivative()(times)
+    slopes[[0, -1]] = 0.0
+    states = np.stack((values, slopes, np.zeros_like(values)), axis=1)  # (n, 3 orders, 3)
+    return np.asarray(BPoly.from_derivatives(times, states)(wanted))
 
 
 def _vectors(base: Rotation, turns: Rotation) -> np.ndarray:
@@ -183,6 +188,19 @@ def parse(text: str, label: str) -> Animation:
         raise ConfigError(f"{label}: not valid YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{label}: holds no keys; valid: {', '.join(_KEYS)}")
+    return animation(content, label)
+
+
+def animation(content: Mapping[str, Any], label: str) -> Animation:
+    """Return the animation that a parsed file describes.
+
+    Args:
+        content: its keys.
+        label: its name, for messages.
+
+    Raises:
+        ConfigError: something in it is wrong; names what.
+    """
     _known(content, _KEYS, label)
     frame = content.get("frame", "rest")
     if frame not in FRAMES:

@@ -158,6 +158,19 @@ def users_of(object_name: str) -> list[str]:
     return [task for task, entry in read().tasks.items() if object_name in entry.objects]
 
 
+def check_unused(object_name: str) -> None:
+    """Check that no task of the user's needs an object.
+
+    Raises:
+        LibraryError: one does; names it.
+    """
+    if tasks := users_of(object_name):
+        raise LibraryError(
+            f"object '{object_name}' plays in {', '.join(tasks)}; remove "
+            f"{'it' if len(tasks) == 1 else 'them'} first"
+        )
+
+
 def remove(name: str) -> None:
     """Remove an object or a task's motion of the user's.
 
@@ -169,11 +182,8 @@ def remove(name: str) -> None:
         own = read()
         if name not in own.objects and name not in own.tasks:
             raise UnknownNameError("object or task of your own", name, [*own.objects, *own.tasks])
-        if name in own.objects and (tasks := users_of(name)):
-            raise LibraryError(
-                f"object '{name}' plays in {', '.join(tasks)}; remove "
-                f"{'it' if len(tasks) == 1 else 'them'} first"
-            )
+        if name in own.objects:
+            check_unused(name)
         relative = f"motions/{name}.npz" if name in own.tasks else f"objects/{name}/"
         _write(
             dataclasses.replace(
