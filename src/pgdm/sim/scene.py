@@ -61,9 +61,9 @@ class TaskCfg:
     tcdm30: bool
     """Whether the task belongs to the abridged suite."""
     pregrasp_source: str
-    """Where the paper's pre-grasp came from: mocap, teleop, labeled or learned."""
+    """Where the paper's pre-grasp came from: mocap, teleop, labeled or learned; search: ours."""
     trajectory_source: str
-    """Where the exemplar motion came from: mocap, expert or animator."""
+    """Where the exemplar motion came from: mocap, expert or animator; keyframes: pgdm's own."""
     paper_success: float | None
     """Success of the paper's PGDM after 50M frames, mean of 3 seeds (0..1)."""
     paper_com_error: float | None
