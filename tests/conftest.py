@@ -22,6 +22,8 @@ settings.load_profile("pgdm")
 CACHE = Path(tempfile.gettempdir()) / f"pgdm-tests-{os.getuid()}"
 DOWNLOADS = CACHE / "downloads"
 MISSING = CACHE / f"missing-{os.getpid()}"
+# Also while tests are collected: which tasks there are is read then.
+os.environ["PGDM_USER_DIR"] = str(CACHE / f"missing-user-{os.getpid()}")
 CHECKOUT: Path | None = None
 if os.environ.get("PGDM_TCDM_ROOT"):
     CHECKOUT = Path(os.environ["PGDM_TCDM_ROOT"]).absolute()

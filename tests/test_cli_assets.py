@@ -166,7 +166,7 @@ def test_the_bars_of_a_terminal_show_bytes_and_counts(monkeypatch: pytest.Monkey
 
     screen = Console(file=io.StringIO(), force_terminal=True, width=100)
     monkeypatch.setattr(assets, "Console", lambda **_: screen)
-    with assets._bars() as progress:
+    with assets.bars() as progress:
         progress("download", 50_000_000, 100_000_000)
         progress("objects airplane", 3, 57)
     assert isinstance(screen.file, io.StringIO)

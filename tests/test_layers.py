@@ -29,7 +29,7 @@ FLOORS: list[set[str]] = [
     {"experiment"},
     {"make"},  # environments by task id
     {"pgdm"},  # the package's own __init__: what `import pgdm` offers
-    {"sweep"},
+    {"sweep", "author"},
     {"report"},
     {"cli", "realworld"},
     {"hydra_plugins"},
@@ -41,7 +41,7 @@ NARROW: dict[str, set[str]] = {"rl": BASE}
 
 # Who may import a third-party package; a package that is not listed may be imported anywhere.
 ALLOWED: dict[str, set[str]] = {
-    "mujoco": {"library", "motion", "sim", "pregrasp", "realworld"},
+    "mujoco": {"library", "motion", "sim", "pregrasp", "author", "realworld"},
     "torchrl": {"envs.torchrl", "rl"},
     "hydra": {"config.store", "sweep.expand", "cli", "hydra_plugins"},
     "omegaconf": {"config.store", "sweep.expand", "sweep.planning", "cli", "hydra_plugins"},

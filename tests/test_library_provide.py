@@ -74,7 +74,7 @@ def test_a_fetch_is_announced_with_size_and_licence(
 
 
 def test_the_two_sources_make_51_tasks() -> None:
-    every = [*figures.GRAB_TASKS, *provide.OTHER_TASKS]
+    every = [*figures.GRAB_TASKS, *figures.OTHER_TASKS]
     assert len(figures.GRAB_TASKS) == 40
     assert len(set(every)) == 51
     assert all(names.hand_of(task) == "adroit" for task in figures.GRAB_TASKS)

@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from pgdm.config.describe import describe
-from pgdm.config.groups import available, conf_dir
-from pgdm.library import open_library
+from pgdm.config.groups import available, folders
+from pgdm.library import animated, open_library, staging
 
 
 @dataclass(frozen=True)
@@ -31,24 +31,26 @@ def read_rows() -> list[TaskRow]:
 
 
 def _row(name: str) -> TaskRow:
-    description = describe(conf_dir() / "task" / f"{name}.yaml")
+    files = [folder / "task" / f"{name}.yaml" for folder in folders(None)]
+    description = describe(next(file for file in files if file.is_file()))
     value = {key.name: key.value for key in description.keys}
-    hand = next(option for key, option in description.defaults.items() if "/hand" in key)
-    success = value["paper_success"]
+    hands = [option for key, option in description.defaults.items() if "/hand" in key]
+    success = value.get("paper_success", "null")
+    # A user's own file may build on another one and leave out what that says.
     return TaskRow(
-        id=value["id"],
-        hand=hand,
-        objects=value["objects"].strip("[]"),
-        pregrasp_source=value["pregrasp_source"],
-        trajectory_source=value["trajectory_source"],
-        tcdm30=value["tcdm30"] == "true",
+        id=value.get("id", name),
+        hand=hands[0] if hands else "",
+        objects=value.get("objects", "").strip("[]"),
+        pregrasp_source=value.get("pregrasp_source", ""),
+        trajectory_source=value.get("trajectory_source", ""),
+        tcdm30=value.get("tcdm30") == "true",
         paper_success="" if success == "null" else f"{float(success):.1%}",
     )
 
 
 def print_tasks(tcdm30: bool) -> None:
     """Print the tasks, and which source of the asset library serves each."""
-    sources = open_library().tasks()
+    sources = dict.fromkeys(animated.TASKS, staging.ANIMATED) | open_library().tasks()
     table = Table(box=None, pad_edge=False)
     for head in ("task", "hand", "objects", "pre-grasp", "motion", "tcdm30"):
         table.add_column(head)

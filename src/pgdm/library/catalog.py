@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -21,10 +22,15 @@ EXPERT_CURE = "Get the expert hand trajectories with 'pgdm assets fetch'."
 """What to do when there are none."""
 
 
-class Library:
-    """The assets under one root, from one or two sources; a checkout wins, task by task.
+_PARTIAL = (staging.OWN, staging.ANIMATED)
 
-    A task takes hand, objects, scene and motion all from the source that serves it.
+
+class Library:
+    """The assets under one root, and the user's own; a checkout wins, task by task.
+
+    A task takes hand, objects, scene and motion all from the source that serves it. What that one
+    has none of comes from elsewhere: objects that the user made from ``own``; hands, table and
+    other objects for a motion of ``own`` or ``animated`` from the best source that is whole.
 
     Args:
         root: the library's folder.
@@ -38,6 +44,15 @@ class Library:
     def sources(self) -> dict[str, Manifest]:
         """Return the manifest of each source that is present, the winning one first."""
         return dict(self._sources)
+
+    def promising(self, task: str, entry: TaskEntry) -> Library:
+        """Return this library as it is once a task of the user's is in it, to build its scene."""
+        empty = Manifest(source=staging.OWN, origin="", imported_at="")
+        own = self._sources.get(staging.OWN, empty)
+        grown = dataclasses.replace(own, tasks={**own.tasks, task: entry})
+        place = self._folders.get(staging.OWN, paths.user() / "library")
+        folders = {**self._folders, staging.OWN: place}
+        return Library(self.root, {**self._sources, staging.OWN: grown}, folders)
 
     def folder(self, source: str) -> Path:
         """Return the folder of a source that is present."""
@@ -74,6 +89,15 @@ class Library:
             UnknownNameError: the task is not in the library.
         """
         return self._source(task, None)
+
+    def origins(self, task: str) -> str:
+        """Return the sources that serve a task, its motion's first, such as ``own+checkout``.
+
+        Raises:
+            UnknownNameError: the task is not in the library.
+        """
+        source = self._source(task, None)
+        return source if source not in _PARTIAL else "+".join((source, *self._whole()[:1]))
 
     def motion(self, motion_id: str, source: str | None = None) -> Motion:
         """Read a task's motion.
@@ -150,7 +174,8 @@ class Library:
         Raises:
             UnknownNameError: the hand is not in the library (or not from that source).
         """
-        found = self._serving("hand", hand, source, {s: m.hands for s, m in self._sources.items()})
+        have = {s: self._sources[s].hands for s in self._whole()}
+        found = self._serving("hand", hand, self._whole_of(source), have)
         return self._existing(found, f"hands/{hand}/hand.xml")
 
     def object_xml(self, object_name: str, source: str | None = None) -> Path:
@@ -159,8 +184,11 @@ class Library:
         Raises:
             UnknownNameError: the object is not in the library (or not from that source).
         """
-        have = {s: m.objects for s, m in self._sources.items()}
-        found = self._serving("object", object_name, source, have)
+        own = self._sources.get(staging.OWN)
+        if own is not None and object_name in own.objects:
+            return self._existing(staging.OWN, f"objects/{object_name}/object.xml")
+        have = {s: self._sources[s].objects for s in self._whole()}
+        found = self._serving("object", object_name, self._whole_of(source), have)
         return self._existing(found, f"objects/{object_name}/object.xml")
 
     def scene_xml(self, source: str | None = None) -> Path:
@@ -169,8 +197,18 @@ class Library:
         Raises:
             LibraryError: the library is empty.
         """
-        found = self._serving("scene", "table", source, {s: ["table"] for s in self._sources})
+        have = {s: ["table"] for s in self._whole()}
+        found = self._serving("scene", "table", self._whole_of(source), have)
         return self._existing(found, "scene/table.xml")
+
+    def _whole(self) -> list[str]:
+        """Return the sources that have hands and a table, the winning one first."""
+        return [source for source in self._sources if source not in _PARTIAL]
+
+    @staticmethod
+    def _whole_of(source: str | None) -> str | None:
+        """Return the source that is asked for hands and table, None for the best one."""
+        return None if source in _PARTIAL else source
 
     def _source(self, task: str, source: str | None) -> str:
         have = {s: list(m.tasks) for s, m in self._sources.items()}
@@ -209,7 +247,12 @@ def open_library(root: Path | None = None) -> Library:
     root = paths.library() if root is None else Path(root)
     folders: dict[str, Path] = {}
     for source in staging.SOURCES:
-        folder = staging.folder_of(root, source)
+        folder = staging.folder_of(*_place(root, source))
         if folder is not None:
             folders[source] = folder
     return Library(root, {s: manifests.read(f) for s, f in folders.items()}, folders)
+
+
+def _place(root: Path, source: str) -> tuple[Path, str]:
+    """Return the folder in which a source's folder lies, and the latter's name."""
+    return (paths.user(), "library") if source == staging.OWN else (root, source)

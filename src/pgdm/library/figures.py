@@ -20,6 +20,14 @@ _GRAB_TASKS = (
 GRAB_TASKS = tuple(_GRAB_TASKS.split())
 """The motion-capture tasks, which the package can serve."""
 
+_OTHER_TASKS = (
+    "dhand-alarmclock dhand-binoculars dhand-cup dhand-elephant dhand-waterbottle "
+    "dmanus-coffeecan dmanus-crackerbox dmanus-sim2real door-open hammer-strike "
+    "spheremedium-relocate"
+)
+OTHER_TASKS = tuple(_OTHER_TASKS.split())
+"""Tasks of the benchmark that only a TCDM checkout has."""
+
 SUBSTEPS = 10
 """Physics steps per control step of every task."""
 

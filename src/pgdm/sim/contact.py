@@ -72,3 +72,14 @@ class HandContact:
         near = (of_hand[:, 0] != of_hand[:, 1]) & (dist < clearance_m)
         geoms = np.where(of_hand[near, 0], pairs[near, 0], pairs[near, 1])
         return self._finger_of_geom[geoms], dist[near]
+
+    def too_near(self, data: mujoco.MjData, clearance_m: float) -> float:
+        """Return by how much the hand's contacts with other things are too close in all, m.
+
+        Args:
+            data: a state whose contacts are current; of this scene, perhaps with wider margins.
+            clearance_m: distance that is wanted.
+        """
+        near = data.contact.dist < clearance_m
+        one, two = self._of_hand[data.contact.geom[near]].T
+        return float((clearance_m - data.contact.dist[near])[one != two].sum())

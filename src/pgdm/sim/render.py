@@ -139,6 +139,19 @@ class Renderer:
         mujoco.mj_camlight(self.model, self._data)
         return self.render(self._data, goal, caption, marks)
 
+    def look(self, lookat: np.ndarray, distance: float, azimuth: float, elevation: float) -> None:
+        """Place the camera.
+
+        Args:
+            lookat: the point it looks at, (3,) m, world frame.
+            distance: from there, m.
+            azimuth: direction of view around the vertical, degrees; 90 looks along +y.
+            elevation: direction of view above the horizontal, degrees.
+        """
+        self._camera.lookat[:] = lookat
+        self._camera.distance = distance
+        self._camera.azimuth, self._camera.elevation = azimuth, elevation
+
     def close(self) -> None:
         """Give back what OpenGL holds; harmless when called twice."""
         self._free()

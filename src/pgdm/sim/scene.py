@@ -61,9 +61,9 @@ class TaskCfg:
     tcdm30: bool
     """Whether the task belongs to the abridged suite."""
     pregrasp_source: str
-    """Where the paper's pre-grasp came from: mocap, teleop, labeled or learned."""
+    """Where the paper's pre-grasp came from: mocap, teleop, labeled or learned; search: ours."""
     trajectory_source: str
-    """Where the exemplar motion came from: mocap, expert or animator."""
+    """Where the exemplar motion came from: mocap, expert or animator; keyframes: pgdm's own."""
     paper_success: float | None
     """Success of the paper's PGDM after 50M frames, mean of 3 seeds (0..1)."""
     paper_com_error: float | None
@@ -131,7 +131,7 @@ class Scene:
     task: TaskCfg
     hand: HandCfg
     asset_source: str
-    """The library's source that serves the task's assets."""
+    """The library's source that serves the task's assets, or its sources: ``own+checkout``."""
 
     def digest(self) -> str:
         """Return a SHA-256 over all that the physics depends on: equal scenes move equally."""
@@ -169,7 +169,9 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
         model = spec.compile()
     except ValueError as error:
         raise SceneError(f"the scene of task '{task.id}' does not compile: {error}") from error
-    return Scene(model, _index(model, task, hand, randomized), task, hand, source)
+    return Scene(
+        model, _index(model, task, hand, randomized), task, hand, library.origins(task.motion)
+    )
 
 
 def _load(file: Path) -> mujoco.MjSpec:

@@ -1,0 +1,175 @@
+"""The motion of a new task: read, mended where asked for, checked, begun where the object rests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.library import animate, motion_checks, own, pose_file
+from pgdm.library.animate import STEP_S, continuous
+from pgdm.library.author_drop import Drop, drop
+from pgdm.library.motion_checks import Poses, TableCheck
+
+ORIGINS = ("com", "mesh")
+
+NEAR_M, NEAR_RAD = 0.01, 0.17
+"""How far the first pose may be from where the object rests: it is moved there, and said."""
+_BLEND_STEPS = 15  # control steps over which that move fades
+_TABLE_M = 0.4  # half of the table's side, less a margin
+
+
+@dataclass(frozen=True)
+class MotionRequest:
+    """What motion is asked for."""
+
+    keyframes: Path | None
+    """YAML file of keyframes; or
+    """
+    poses: Path | None
+    """a recorded motion: .csv, .npz or .json."""
+    origin: str = "com"
+    """What recorded positions are of: the centre of mass, or the origin of the mesh's file."""
+    smooth: bool = False
+    """Filter a recorded motion, and give it a beginning and an end at rest."""
+    slower: float = 1.0
+    """Play it slower by this factor."""
+    lift: bool = False
+    """Raise what lies in the table."""
+    settle: bool = False
+    """Carry the whole motion to where the object rests, however far that is."""
+
+
+@dataclass(frozen=True)
+class CheckedMotion:
+    """A motion that a hand may carry an object along."""
+
+    poses: Poses
+    """Its first is where the object rests."""
+    notes: list[str]
+    """What was changed, a sentence each."""
+    source: str
+    """``animator`` or ``recorded``."""
+
+
+def make_motion(
+    request: MotionRequest, object_xml: Path, model: mujoco.MjModel, body: int
+) -> CheckedMotion:
+    """Make the motion of a task.
+
+    Args:
+        request: what is asked for.
+        object_xml: the object's model.
+        model: the task's scene.
+        body: id of the object's body in it.
+
+    Raises:
+        ConfigError: the motion cannot be carried; says where and what would help.
+        CorruptAssetError: its file is damaged.
+    """
+    if (request.keyframes is None) == (request.poses is None):
+        raise ConfigError("a task needs one motion: --keyframes FILE or --poses FILE")
+    notes: list[str] = []
+    if request.keyframes is not None:
+        poses, label = _animated(request.keyframes, object_xml, notes), str(request.keyframes)
+    else:
+        assert request.poses is not None
+        poses, label = _recorded(request, model, body, notes), str(request.poses)
+    if request.slower != 1.0:
+        poses = motion_checks.slower(poses, request.slower)
+        notes.append(f"played {request.slower:g} times slower")
+    if request.smooth:
+        poses = motion_checks.smoothed(poses)
+        notes.append("smoothed, with a rest put before and after")
+    poses = _begun_at_rest(poses, request.settle, object_xml, label, notes)
+    table = TableCheck(model, body)
+    if request.lift:
+        raised = table.lifted(poses)
+        most = float((raised.pos - poses.pos)[:, 2].max())
+        if most > 0:
+            notes.append(f"raised by up to {1e3 * most:.0f} mm where it was in the table")
+        poses = raised
+    motion_checks.check_motion(poses, label)
+    table.check(poses, label)
+    return CheckedMotion(poses, notes, "recorded" if request.keyframes is None else "animator")
+
+
+def _animated(path: Path, object_xml: Path, notes: list[str]) -> Poses:
+    animation = animate.read(path)
+    if animation.frame == "world":
+        return Poses(*animation.trajectory())
+    turn = Rotation.from_quat(animation.quat, scalar_first=True)
+    rest = drop(object_xml, (float(animation.place[0]), float(animation.place[1])), turn)
+    _check_rest(rest, str(path))
+    if rest.turned_rad > NEAR_RAD:
+        notes.append(
+            f"the object falls over when it is put so, by {np.rad2deg(rest.turned_rad):.0f} "
+            "degrees; the motion begins where it comes to rest"
+        )
+    return Poses(*animation.at(rest.com, rest.quat))
+
+
+def _recorded(request: MotionRequest, model: mujoco.MjModel, body: int, notes: list[str]) -> Poses:
+    assert request.poses is not None
+    if request.origin not in ORIGINS:
+        raise UnknownNameError("origin", request.origin, ORIGINS)
+    found = pose_file.read(request.poses)
+    notes += found.repairs
+    if request.origin == "com":
+        return Poses(found.pos, found.quat)
+    offset = model.body_ipos[body]
+    name = model.body(body).name.split("/")[0]
+    if name in own.read().objects:
+        offset = np.array(own.facts(name)["origin_in_mesh_m"])
+    turns = Rotation.from_quat(found.quat, scalar_first=True)
+    return Poses(found.pos + turns.apply(offset), found.quat)
+
+
+def _begun_at_rest(
+    poses: Poses, settle: bool, object_xml: Path, label: str, notes: list[str]
+) -> Poses:
+    """Return the motion with its first pose where the object rests on the table."""
+    first = Rotation.from_quat(poses.quat[0], scalar_first=True)
+    place = float(poses.pos[0, 0]), float(poses.pos[0, 1])
+    if max(abs(place[0]), abs(place[1])) > _TABLE_M:
+        raise ConfigError(
+            f"{label}: begins at x = {place[0]:.2f}, y = {place[1]:.2f} m, beside the table, which "
+            f"reaches to {_TABLE_M:g} m"
+        )
+    rest = drop(object_xml, place, first)
+    _check_rest(rest, label)
+    away = float(np.linalg.norm(rest.com - poses.pos[0]))
+    if (away > NEAR_M or rest.turned_rad > NEAR_RAD) and not settle:
+        raise ConfigError(
+            f"{label}: the object does not rest where the motion begins: it ends {100 * away:.1f} "
+            f"cm away, turned by {np.rad2deg(rest.turned_rad):.0f} degrees; --settle carries the "
+            "motion to where it rests"
+        )
+    turn = Rotation.from_quat(rest.quat, scalar_first=True) * first.inv()
+    turns = Rotation.from_quat(poses.quat, scalar_first=True)
+    if settle:
+        notes.append(f"carried by {1e3 * away:.0f} mm to where the object rests")
+        quat = (turns * first.inv() * turn * first).as_quat(scalar_first=True)
+        return Poses(poses.pos - poses.pos[0] + rest.com, continuous(quat))
+    if away > 1e-4 or rest.turned_rad > 1e-3:
+        notes.append(
+            f"its first {_BLEND_STEPS * STEP_S:.1f} s were bent to begin where the object rests, "
+            f"{1e3 * away:.1f} mm and {np.rad2deg(rest.turned_rad):.1f} degrees away"
+        )
+    share = np.clip(1.0 - np.arange(len(poses.pos)) / _BLEND_STEPS, 0.0, 1.0)
+    share = share**3 * (10 - 15 * share + 6 * share**2)  # fades without a kink
+    bends = Rotation.from_rotvec(np.outer(share, turn.as_rotvec()))
+    quat = (bends * turns).as_quat(scalar_first=True)
+    return Poses(poses.pos + np.outer(share, rest.com - poses.pos[0]), continuous(quat))
+
+
+def _check_rest(rest: Drop, label: str) -> None:
+    if not rest.rests:
+        raise ConfigError(
+            f"{label}: the object does not come to rest on the table where it is put "
+            f"({100 * rest.speed_m_s:.1f} cm/s after 4 s); turn it in the file, so that it lies"
+        )

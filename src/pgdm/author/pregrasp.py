@@ -1,0 +1,136 @@
+"""The pre-grasp of a new task: searched near the object, or taken from a file or another task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pgdm.errors import ConfigError
+from pgdm.library import Library, pregrasp_file
+from pgdm.library.motion_checks import Poses
+from pgdm.library.report import Progress
+from pgdm.mdp.actions import wrist_path
+from pgdm.motion.reference import ObjectReference
+from pgdm.pregrasp.near import poses_near
+from pgdm.sim.contact import HandContact
+from pgdm.sim.scene import Scene
+
+CHOICES = ("mean", "open", "later")
+
+SLACK_M, SLACK_RAD = 0.03, 0.2
+"""By how much the wrist, carried rigidly with the object, may leave its range: so much the fingers
+and a policy's corrections make up for."""
+_TOUCH_M = 1e-4
+
+
+@dataclass(frozen=True)
+class FoundPregrasp:
+    """A hand at its pre-grasp."""
+
+    qpos: np.ndarray  # (nq,) whole scene
+    source: str
+    """What the task's file says of it."""
+    notes: list[str]
+
+
+def make_pregrasp(
+    choice: str, scene: Scene, qpos: np.ndarray, poses: Poses, library: Library, progress: Progress
+) -> FoundPregrasp:
+    """Make the pre-grasp of a new task.
+
+    Args:
+        choice: ``mean`` or ``open`` (a search with the fingers near that posture), ``later`` (the
+            hand's reset pose), a pre-grasp's file, or a task whose fingers are taken.
+        scene: the new task's.
+        qpos: whole scene (nq,), the object where it rests.
+        poses: the task's motion.
+        library: where other tasks' pre-grasps are.
+        progress: told how far the search is.
+
+    Raises:
+        ConfigError: there is no such pre-grasp, it does not fit, or the wrist cannot follow.
+        SceneError: none was found that touches nothing.
+    """
+    if choice == "later":
+        return FoundPregrasp(qpos, "none", ["starts from the hand's reset pose: no pre-grasp yet"])
+    reach = wrist_beyond(scene, poses)
+    if choice.endswith(".npz"):
+        found = _from_file(Path(choice), scene, qpos)
+    else:
+        fingers = _fingers(choice, scene, library)
+        best = poses_near(
+            scene, qpos, fingers, reach, progress=lambda i, n: progress("pre-grasp", i, n)
+        )[0]
+        text = ", ".join(f"{1e3 * d:.0f}" for d in best.tip_distances_m)
+        notes = [f"pre-grasp: fingertips {text} mm from the object, nothing touched"]
+        found = FoundPregrasp(best.qpos, "search", notes)
+    if (beyond := reach(found.qpos)) > 0.0:
+        raise ConfigError(
+            f"the wrist cannot follow the motion: carried with the object it would leave its range "
+            f"by {beyond:.2f} (m or rad) more than a policy can make up for; shorten the motion, "
+            "or put the object elsewhere (place in the keyframes)"
+        )
+    return found
+
+
+def wrist_beyond(scene: Scene, poses: Poses) -> Callable[[np.ndarray], float]:
+    """Return what tells, for qpos (nq,), by how much the wrist would leave its range, m or rad."""
+    reference = ObjectReference(torch.from_numpy(poses.pos), torch.from_numpy(poses.quat))
+    low, high = scene.model.jnt_range[: scene.index.num_base_joints].T
+    slack = np.array([SLACK_M] * 3 + [SLACK_RAD] * (len(low) - 3))
+
+    def beyond(qpos: np.ndarray) -> float:
+        path = wrist_path(scene.index, reference, torch.from_numpy(qpos)).numpy()
+        return float(np.maximum(low - slack - path, path - high - slack).max().clip(0.0))
+
+    return beyond
+
+
+def _from_file(path: Path, scene: Scene, qpos: np.ndarray) -> FoundPregrasp:
+    if not path.is_file():
+        raise ConfigError(f"--pregrasp {path}: there is no such file")
+    stored, nu = pregrasp_file.read(path).pose.qpos, scene.model.nu
+    if stored.shape != qpos.shape:
+        raise ConfigError(
+            f"--pregrasp {path}: has {stored.size} joint positions, hand '{scene.hand.name}' with "
+            f"this object has {qpos.size}"
+        )
+    found = np.concatenate((stored[:nu], qpos[nu:]))
+    depth = HandContact(scene).depth(found)
+    if depth > _TOUCH_M:
+        raise ConfigError(
+            f"--pregrasp {path}: the hand is {1e3 * depth:.1f} mm inside the object or the table"
+        )
+    return FoundPregrasp(found, "file", [f"pre-grasp as in {path.name}"])
+
+
+def _fingers(choice: str, scene: Scene, library: Library) -> np.ndarray:
+    """Return the finger joints (J,) rad that a search should stay near."""
+    first = scene.hand.num_base_joints + scene.hand.num_wrist_joints
+    count = scene.model.nu - first
+    if choice == "open":
+        return np.zeros(count)
+    if choice == "mean":
+        mean = np.array(scene.hand.mean_fingers_rad)
+        if mean.shape != (count,):
+            raise ConfigError(
+                f"hand '{scene.hand.name}' states {mean.size} mean finger joints, it has {count}: "
+                "use --pregrasp open"
+            )
+        return mean
+    if choice not in library.tasks():
+        raise ConfigError(
+            f"--pregrasp '{choice}' is neither {', '.join(CHOICES)}, a .npz file, nor a task of "
+            "the library ('pgdm assets list')"
+        )
+    entry = library.entry(choice)
+    if entry.hand != scene.hand.name or "mined" not in entry.starts:
+        raise ConfigError(
+            f"--pregrasp '{choice}': its pre-grasp is of hand '{entry.hand}', this task's hand is "
+            f"'{scene.hand.name}'"
+        )
+    return library.motion(choice).starts["mined"].qpos[first : scene.model.nu]

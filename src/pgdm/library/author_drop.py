@@ -1,0 +1,102 @@
+"""Letting an object fall onto the table, to see whether it is one that can lie there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pgdm.errors import LibraryError
+from pgdm.library.lowest import lowest
+
+HEIGHT_M = 0.005
+"""Height of the lowest point at the start."""
+TIME_S = 4.0
+SINK_M = 0.002
+"""How deep the lowest point may be in the table at the end; the contact margin is 0.5 mm."""
+DRIFT_M = 0.03
+"""How far it may go sideways in the second half of the time."""
+REST_M_S, REST_RAD_S = 0.01, 0.1
+_TABLE = """<mujoco><option timestep="0.004" iterations="20" noslip_iterations="20"/>
+<default><geom friction="1 0.5 0.01" margin="0.0005"/></default>
+<worldbody><geom type="box" size="0.45 0.45 0.025" pos="0 0 -0.025"/></worldbody></mujoco>"""
+
+
+@dataclass(frozen=True)
+class Drop:
+    """How an object came to lie."""
+
+    qpos: np.ndarray  # (6,) its joints at the end, m and rad
+    quat: np.ndarray  # (4,) wxyz, its orientation at the end
+    com: np.ndarray  # (3,) m, its centre of mass at the end
+    turned_rad: float
+    """By how much it lies turned from how it was put."""
+    sunk_m: float
+    """Depth of its lowest point in the table at the end."""
+    drift_m: float
+    """How far its centre of mass went sideways in the second half of the time."""
+    speed_m_s: float
+    turn_rad_s: float
+
+    @property
+    def rests(self) -> bool:
+        """Whether it lies still on the table."""
+        still = self.speed_m_s < REST_M_S and self.turn_rad_s < REST_RAD_S
+        return still and self.sunk_m < SINK_M and self.drift_m < DRIFT_M
+
+
+def drop(
+    object_xml: Path, place: tuple[float, float] = (0.0, 0.0), turn: Rotation | None = None
+) -> Drop:
+    """Put an object a little above the table and let it fall.
+
+    Args:
+        object_xml: its model.
+        place: where its centre of mass begins, (x, y) m.
+        turn: its orientation; None is as it stands in its own frame.
+
+    Raises:
+        LibraryError: the simulation diverges.
+    """
+    spec = mujoco.MjSpec.from_string(_TABLE)
+    spec.attach(
+        mujoco.MjSpec.from_file(str(object_xml)), prefix="it/", frame=spec.worldbody.add_frame()
+    )
+    spec.body("it/object").pos = (0.0, 0.0, 0.0)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    body = model.body("it/object").id
+    start = Rotation.identity() if turn is None else turn
+    data.qpos[3:] = start.as_euler("XYZ")
+    data.qpos[:2] = np.array(place) - start.apply(model.body_ipos[body])[:2]
+    data.qpos[2] = HEIGHT_M - lowest(model, data, body)
+    half = np.zeros(3)
+    steps = round(TIME_S / model.opt.timestep)
+    for step in range(steps):
+        mujoco.mj_step(model, data)
+        if step == steps // 2:
+            half = data.xipos[body].copy()
+    if data.warning.number.any() or not np.isfinite(data.qpos).all():
+        raise LibraryError(f"{object_xml.parent.name}: the simulation of its fall diverges")
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    end = data.xipos[body]
+    velocity = np.zeros(6)
+    mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
+    return Drop(
+        qpos=data.qpos.copy(),
+        quat=data.xquat[body].copy(),
+        turned_rad=_turned(start, data.xquat[body]),
+        com=end.copy(),
+        sunk_m=max(0.0, -lowest(model, data, body)),
+        drift_m=float(np.linalg.norm(end[:2] - half[:2])),
+        speed_m_s=float(np.linalg.norm(velocity[3:])),
+        turn_rad_s=float(np.linalg.norm(velocity[:3])),
+    )
+
+
+def _turned(start: Rotation, quat: np.ndarray) -> float:
+    return float((start.inv() * Rotation.from_quat(quat, scalar_first=True)).magnitude())

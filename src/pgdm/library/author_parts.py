@@ -1,0 +1,152 @@
+"""Convex parts of a mesh: what touches things in the simulation."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import version
+
+import numpy as np
+import trimesh
+
+from pgdm import paths
+from pgdm.errors import ConfigError, LibraryError
+from pgdm.library import safe_npz
+from pgdm.library.author_mesh import SoundMesh
+from pgdm.library.report import Progress, silent
+
+_POLL_S = 0.2
+_TYPICAL_S = 30  # what most meshes take; the algorithm does not say how far it is
+_LEAST_SHARE = 1e-5  # of the whole: smaller parts are slivers that MuJoCo refuses
+_MOST_PARTS = 64
+
+
+@dataclass(frozen=True)
+class PartsCfg:
+    """How a mesh is taken apart."""
+
+    threshold: float = 0.05
+    """Concavity that is left, as a share of the size (0.01..1); lower gives more parts."""
+    max_parts: int | None = None
+    """Parts at most, or None for as many as the threshold asks for."""
+
+    def check(self) -> None:
+        """Check the values.
+
+        Raises:
+            ConfigError: one is out of its range.
+        """
+        if not 0.01 <= self.threshold <= 1.0:
+            raise ConfigError(f"--threshold is {self.threshold}; valid: 0.01 to 1")
+        if self.max_parts is not None and not 1 <= self.max_parts <= _MOST_PARTS:
+            raise ConfigError(f"--parts is {self.max_parts}; valid: 1 to {_MOST_PARTS}")
+
+
+@dataclass(frozen=True)
+class Part:
+    """One convex part."""
+
+    vertices: np.ndarray = field(repr=False)
+    """(V, 3) m, in the frame of the mesh."""
+    faces: np.ndarray = field(repr=False)
+    """(F, 3) vertex numbers."""
+
+    def trimesh(self) -> trimesh.Trimesh:
+        """Return it as trimesh's own class."""
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+
+def convex_parts(mesh: SoundMesh, cfg: PartsCfg, progress: Progress = silent) -> list[Part]:
+    """Take a mesh apart (CoACD); equal input gives equal parts, from a cache if done before.
+
+    Args:
+        mesh: what to take apart.
+        cfg: how finely.
+        progress: told the seconds that went by, of the time that most meshes take.
+
+    Raises:
+        ConfigError: a setting is out of range.
+        LibraryError: nothing came out.
+    """
+    cfg.check()
+    cache = paths.home() / "parts" / f"{_key(mesh, cfg)}.npz"
+    if cache.is_file():
+        return _read(safe_npz.read_npz(cache))
+    if mesh.volume_m3 / mesh.hull_m3 > 1.0 - 1e-6 and mesh.closed and mesh.num_bodies == 1:
+        hull = mesh.trimesh().convex_hull  # nothing to take apart
+        return [Part(np.array(hull.vertices), np.array(hull.faces))]
+    raw = _in_background(lambda: _decomposed(mesh, cfg), progress)
+    parts = _sound(raw)
+    if not parts:
+        raise LibraryError("the mesh has no convex parts; repair it in the program that made it")
+    if len(parts) > _MOST_PARTS:
+        raise LibraryError(
+            f"the mesh has {len(parts)} convex parts, more than {_MOST_PARTS}; give a --threshold "
+            f"above {cfg.threshold:g}, or --parts N"
+        )
+    cache.parent.mkdir(parents=True, exist_ok=True)
+    arrays = {f"v{i:03d}": p.vertices for i, p in enumerate(parts)}
+    arrays |= {f"f{i:03d}": p.faces for i, p in enumerate(parts)}
+    with paths.replacing(cache) as temp:
+        np.savez_compressed(temp, **arrays)  # type: ignore[arg-type]
+    return parts
+
+
+def _key(mesh: SoundMesh, cfg: PartsCfg) -> str:
+    digest = hashlib.sha256(f"{cfg} coacd {version('coacd')}".encode())
+    digest.update(np.ascontiguousarray(mesh.vertices).tobytes())
+    digest.update(np.ascontiguousarray(mesh.faces).tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _read(arrays: dict[str, np.ndarray]) -> list[Part]:
+    count = sum(name.startswith("v") for name in arrays)
+    return [Part(arrays[f"v{i:03d}"], arrays[f"f{i:03d}"]) for i in range(count)]
+
+
+def _decomposed(mesh: SoundMesh, cfg: PartsCfg) -> list[tuple[np.ndarray, np.ndarray]]:
+    import coacd
+
+    coacd.set_log_level("error")
+    most = -1 if cfg.max_parts is None else cfg.max_parts
+    return coacd.run_coacd(
+        coacd.Mesh(mesh.vertices, mesh.faces),
+        threshold=cfg.threshold,
+        max_convex_hull=most,
+        max_ch_vertex=64,
+        decimate=True,
+        seed=0,
+    )
+
+
+def _in_background(
+    work: Callable[[], list[tuple[np.ndarray, np.ndarray]]], progress: Progress
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Do the work in a thread of its own, so that Ctrl-C ends the program at once."""
+    results: list[list[tuple[np.ndarray, np.ndarray]]] = []
+    thread = threading.Thread(target=lambda: results.append(work()), daemon=True)
+    thread.start()
+    waited = 0.0
+    while thread.is_alive():
+        thread.join(_POLL_S)
+        waited += _POLL_S
+        seconds = int(waited)
+        progress("convex parts, s", seconds, max(_TYPICAL_S, seconds + 5))
+    return results[0] if results else []
+
+
+def _sound(raw: list[tuple[np.ndarray, np.ndarray]]) -> list[Part]:
+    """Return the parts with a volume, the largest first."""
+    hulls = []
+    for vertices, _ in raw:
+        try:
+            # Once more the hull: what was decimated may be dented by rounding.
+            hulls.append(trimesh.convex.convex_hull(np.asarray(vertices, np.float64)))
+        except (ValueError, RuntimeError, IndexError):  # Qhull: a sliver without a volume
+            continue
+    whole = sum(hull.volume for hull in hulls)
+    kept = [h for h in hulls if h.volume > _LEAST_SHARE * whole]
+    kept.sort(key=lambda h: -h.volume)
+    return [Part(np.array(h.vertices), np.array(h.faces)) for h in kept]

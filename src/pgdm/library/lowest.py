@@ -1,0 +1,44 @@
+"""How far down a body reaches."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+
+def lowest(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float:
+    """Return the height of the lowest point of what a body touches with, m, world frame.
+
+    Args:
+        model: the scene.
+        data: its state; kinematics are brought up to date.
+        body: id of the body; without contact geoms its origin counts.
+    """
+    mujoco.mj_kinematics(model, data)
+    touching = np.flatnonzero(
+        (model.geom_bodyid == body) & ((model.geom_contype | model.geom_conaffinity) != 0)
+    )
+    heights = [
+        data.geom_xpos[g, 2] - _reach(model, g, data.geom_xmat[g].reshape(3, 3)[2])
+        for g in touching.tolist()
+    ]
+    return float(min(heights, default=data.xpos[body, 2]))
+
+
+def _reach(model: mujoco.MjModel, geom: int, down: np.ndarray) -> float:
+    """Return how far a geom reaches down from its centre; ``down``: the world's z in its frame."""
+    size, kind = model.geom_size[geom], mujoco.mjtGeom(model.geom_type[geom])
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first = model.mesh_vertadr[mesh]
+        points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+        return float(-(points @ down).min())
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return float(size[0])
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return float(size[0] + size[1] * abs(down[2]))
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        return float(size[0] * np.hypot(down[0], down[1]) + size[1] * abs(down[2]))
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        return float(np.linalg.norm(size * down))
+    return float(np.abs(size * down).sum())  # a box

@@ -1,0 +1,210 @@
+"""A hand held around an object without touching it: a pre-grasp where nobody has shown one.
+
+A cross-entropy search over the hand's joints, from several directions of the wrist. It wants the
+fingertips a finger's breadth from the object, the thumb across from the others, the object in the
+middle between them, the fingers near a given posture, and nothing touched.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from pgdm import seeding
+from pgdm.errors import SceneError
+from pgdm.sim.contact import HandContact
+from pgdm.sim.scene import Scene
+
+CLEARANCE_M = 0.003
+"""Distance that the search keeps; what is found touches nothing at all."""
+TIP_DISTANCE_M = 0.015
+"""Wanted distance of the fingertips from the object."""
+FAR_M = 0.3  # beyond which a distance is no longer measured
+
+STARTS, ROUNDS, SAMPLES, ELITE = 8, 30, 48, 8
+_SPREAD = (0.04, 0.3, 0.2)  # first spread: slides m, hinges rad, fingers rad
+_FLOOR = 0.03  # of the first spread that is left at the end
+_WRIST_RAD = (0.7, 0.7, 1.3)  # directions of the wrist that are begun at, rad about each axis
+_WEIGHTS = {
+    "depth": 20.0,  # a metre of penetration, against metres of distance
+    "middle": 0.5,
+    "across": 0.03,
+    "posture": 0.01,  # a radian^2 of the fingers away from their posture
+    "wrist": 0.01,  # a radian^2 of the wrist away from its rest
+    "beyond": 1.0,
+}
+
+
+@dataclass(frozen=True)
+class NearPose:
+    """A pose that was found."""
+
+    qpos: np.ndarray  # (nq,) whole scene
+    cost: float
+    tip_distances_m: np.ndarray  # (F,) of the fingertips' links from the object
+
+
+Beyond = Callable[[np.ndarray], float]
+"""qpos (nq,) -> by how much the wrist would leave its range on the way, m or rad; 0 is good."""
+Told = Callable[[int, int], None]
+"""Told how many of how many directions are searched."""
+
+
+def poses_near(
+    scene: Scene,
+    qpos: np.ndarray,
+    fingers: np.ndarray,
+    beyond: Beyond,
+    seed: int = 0,
+    progress: Told = lambda done, total: None,
+) -> list[NearPose]:
+    """Search poses of the hand near the object; equal arguments give equal poses.
+
+    Args:
+        scene: of the task.
+        qpos: whole scene (nq,); the objects stay as they are there.
+        fingers: wanted finger joints (J,), rad.
+        beyond: what else speaks against a pose.
+        seed: of the search.
+        progress: told how far it is.
+
+    Returns:
+        Poses that touch nothing, the best first.
+
+    Raises:
+        SceneError: none was found.
+    """
+    search = _Search(scene, np.asarray(qpos, float), fingers, beyond)
+    stream = seeding.numpy_stream(seed, "near")
+    found = []
+    for start in range(STARTS):
+        progress(start, STARTS)
+        pose = search.run(stream, first=start == 0)
+        if pose is not None:
+            found.append(pose)
+    progress(STARTS, STARTS)
+    if not found:
+        raise SceneError(
+            f"no pose of hand '{scene.hand.name}' near the object was found that touches nothing; "
+            "put the object elsewhere on the table, or give a pose with --pregrasp FILE"
+        )
+    return sorted(found, key=lambda pose: pose.cost)
+
+
+class _Search:
+    """The search's scene, and what a pose costs in it."""
+
+    def __init__(self, scene: Scene, qpos: np.ndarray, fingers: np.ndarray, beyond: Beyond) -> None:
+        self._scene, self._qpos, self._beyond = scene, qpos, beyond
+        self._contact = HandContact(scene)
+        self._model = model = copy.copy(scene.model)
+        model.geom_margin[:] = np.maximum(model.geom_margin, CLEARANCE_M)
+        self._data = mujoco.MjData(model)
+        nu, base = model.nu, scene.index.num_base_joints
+        self._nu, self._base = nu, base
+        self._first = self._contact.first_finger_joint
+        self._low, self._high = model.jnt_range[:nu].T.copy()
+        self._posture = np.zeros(nu)
+        self._posture[self._first :] = fingers
+        self._posture = self._posture.clip(self._low, self._high)
+        self._scale = np.full(nu, _SPREAD[2])
+        self._scale[:3], self._scale[3:base] = _SPREAD[0], _SPREAD[1]
+        self._tips = scene.index.point_geoms[scene.index.fingertips]
+        self._links = [self._link(tip) for tip in self._tips]
+        body = scene.index.object_body
+        self._object = np.flatnonzero(
+            (model.geom_bodyid == body) & ((model.geom_contype | model.geom_conaffinity) != 0)
+        )
+
+    def run(self, stream: np.random.Generator, first: bool) -> NearPose | None:
+        """Search from one direction of the wrist, the hand's own one first."""
+        start = self._posture.copy()
+        limits = np.array(_WRIST_RAD[: self._base - 3])
+        start[3 : self._base] = 0.0 if first else stream.uniform(-limits, limits)
+        start = self._centred(start.clip(self._low, self._high))
+        mean, spread = np.zeros(self._nu), np.ones(self._nu)
+        best, best_cost = None, np.inf
+        for _ in range(ROUNDS):
+            moves = mean + spread * stream.standard_normal((SAMPLES, self._nu))
+            joints = (start + self._scale * moves).clip(self._low, self._high)
+            costs = np.array([self._cost(row)[0] for row in joints])
+            order = np.argsort(costs)[:ELITE]
+            if costs[order[0]] < best_cost:
+                best, best_cost = joints[order[0]].copy(), float(costs[order[0]])
+            mean, spread = moves[order].mean(axis=0), moves[order].std(axis=0) + _FLOOR
+        if best is None:
+            return None
+        cost, distances = self._cost(best)
+        qpos = np.concatenate((best, self._qpos[self._nu :]))
+        if self._contact.depth(qpos) > 0.0:
+            return None
+        return NearPose(qpos, cost, distances)
+
+    def _cost(self, joints: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return what a pose costs, and the fingertips' distances (F,) m."""
+        model, data = self._model, self._data
+        self._place(joints)
+        mujoco.mj_collision(model, data)
+        depth = self._contact.too_near(data, CLEARANCE_M)
+        distances = np.array([self._distance(link) for link in self._links])
+        com = data.xipos[self._scene.index.object_body]
+        tips = data.geom_xpos[self._tips]
+        ways = tips - com
+        ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-6)
+        # The thumb is each hand's last finger.
+        across = np.linalg.norm(ways[-1] + ways[:-1].mean(axis=0))
+        fingers = joints[self._first :] - self._posture[self._first :]
+        terms = {
+            "depth": depth,
+            "middle": float(np.linalg.norm(self._middle() - com)),
+            "across": float(across),
+            "posture": float((fingers**2).mean()),
+            "wrist": float((joints[3 : self._first] ** 2).mean()),
+            "beyond": self._beyond(np.concatenate((joints, self._qpos[self._nu :]))),
+        }
+        cost = float(np.abs(distances - TIP_DISTANCE_M).mean())
+        return cost + sum(_WEIGHTS[name] * value for name, value in terms.items()), distances
+
+    def _place(self, joints: np.ndarray) -> None:
+        self._data.qpos[:] = self._qpos
+        self._data.qpos[: self._nu] = joints
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
+
+    def _middle(self) -> np.ndarray:
+        """Return the point (3,) m, world frame, between the thumb's tip and the others."""
+        tips = self._data.geom_xpos[self._tips]
+        return 0.5 * (tips[-1] + tips[:-1].mean(axis=0))
+
+    def _centred(self, joints: np.ndarray) -> np.ndarray:
+        """Return joints with the slides moved so that the fingertips are around the object."""
+        self._place(joints)
+        mount = np.empty(9)
+        mujoco.mju_quat2Mat(mount, self._scene.index.mount_quat)
+        way = self._data.xipos[self._scene.index.object_body] - self._middle()
+        moved = joints.copy()
+        moved[:3] += mount.reshape(3, 3).T @ way
+        return moved.clip(self._low, self._high)
+
+    def _link(self, tip: int) -> np.ndarray:
+        """Return the contact geoms of the link that carries a fingertip's point."""
+        model = self._model
+        body = model.geom_bodyid[tip]
+        while True:
+            touching = (model.geom_contype | model.geom_conaffinity) != 0
+            geoms = np.flatnonzero((model.geom_bodyid == body) & touching)
+            if len(geoms) or body == 0:
+                return geoms if body else np.array([tip])
+            body = model.body_parentid[body]
+
+    def _distance(self, link: np.ndarray) -> float:
+        ends = np.zeros(6)
+        return min(
+            mujoco.mj_geomDistance(self._model, self._data, a, b, FAR_M, ends)
+            for a in link.tolist()
+            for b in self._object.tolist()
+        )
