@@ -9,7 +9,7 @@ from pgdm.config.store import compose
 from pgdm.envs.film import film_expert, film_motion, film_reach
 from pgdm.errors import ConfigError
 from pgdm.experiment import assets, env_builder
-from pgdm.library import ensure, ensure_expert
+from pgdm.library import ensure_expert
 from pgdm.library.expert_index import ExpertEntry
 from pgdm.pregrasp.rollout import play
 from pgdm.pregrasp.sources import no_plan

@@ -32,6 +32,8 @@ _SPAN_M = 0.05
 """Least length of the middle finger from the wrist on, an infant's."""
 _FLAT_M = 0.003
 """By how much a right hand's thumb may seem to lie behind its back."""
+_WORLD_M = 1e6
+"""No coordinate is larger, whatever its unit."""
 _MM, _CM = 1e-3, 1e-2
 
 
@@ -68,8 +70,10 @@ class Keypoints:
                 f"{label}: {' x '.join(map(str, points.shape)) or 'one'} numbers are no hand; it "
                 "takes 16 joints or 21 keypoints of x, y, z"
             )
-        if not np.isfinite(points).all():
-            row, axis = np.argwhere(~np.isfinite(points))[0]
+        # NaN compares as false.
+        wrong = np.argwhere(~(np.abs(points) < _WORLD_M))
+        if len(wrong):
+            row, axis = wrong[0]
             raise ConfigError(f"{label}: point {row} has {'xyz'[axis]} = {points[row, axis]}")
         order = order or ("mano" if len(points) == 16 else "openpose")
         if order not in ORDERS:

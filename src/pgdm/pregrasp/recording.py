@@ -18,7 +18,7 @@ from pgdm.errors import ConfigError, CorruptAssetError, UnknownNameError
 from pgdm.library import safe_npz
 from pgdm.library.motion_file import check_unit, numbers
 from pgdm.library.safe_pickle import read_bytes, reason
-from pgdm.pregrasp.keypoints import Keypoints
+from pgdm.pregrasp.keypoints import ORDERS, Keypoints
 
 FORMATS = (".npz", ".json", ".csv")
 """Endings of files that can be read."""
@@ -92,7 +92,11 @@ def parse(arrays: Mapping[str, Any], label: str) -> Recording:
         raise CorruptAssetError(
             f"{label}: 'joints' has shape {joints.shape}; it takes (frames, 16 or 21, 3)"
         )
-    order = None if "order" not in arrays else str(np.asarray(arrays["order"])[()])
+    order = arrays.get("order")
+    if isinstance(order, np.ndarray) and order.ndim == 0:
+        order = order.item()
+    if order is not None and not isinstance(order, str):
+        raise CorruptAssetError(f"{label}: 'order' is no word; valid: {', '.join(ORDERS)}")
     one = len(joints) == 1
     frames = tuple(
         Keypoints.of(points, order, label if one else f"{label}, frame {i}")
