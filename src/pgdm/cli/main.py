@@ -129,6 +129,9 @@ def view(
         bool,
         typer.Option("--expert", help="Move the hand as a person's moved; spheres show contacts."),
     ] = False,
+    reach: Annotated[
+        bool, typer.Option("--reach", help="Play the plan that brings the hand to its pre-grasp.")
+    ] = False,
     ablations: Annotated[
         bool, typer.Option("--ablations", help="Show the start under each ablation instead.")
     ] = False,
@@ -139,12 +142,16 @@ def view(
 ) -> None:
     """Replay a task's exemplar motion with the hand at its pre-grasp, or as a person moved it."""
     from pgdm.cli.ablations import view_ablations
-    from pgdm.cli.view import view_expert, view_task
+    from pgdm.cli.view import view_expert, view_reach, view_task
 
     if (ablations or image is not None) and (video is not None or expert or not ablations):
         raise ConfigError("--ablations and --image FILE go together, without --video or --expert")
+    if reach and (ablations or expert):
+        raise ConfigError("--reach goes without --ablations and --expert")
     if ablations:
         return view_ablations(task, image, pregrasp, offline)
+    if reach:
+        return view_reach(task, video, pregrasp, offline)
     if expert:
         return view_expert(task, video, offline)
     return view_task(task, video, pregrasp, offline)

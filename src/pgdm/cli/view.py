@@ -1,4 +1,4 @@
-"""``pgdm view``: a task's exemplar motion, with the hand at its pre-grasp or the expert's."""
+"""``pgdm view``: a task's exemplar motion, the reach before it, and the expert's hand."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from pathlib import Path
 
 from pgdm.cli.train import notify
 from pgdm.config.store import compose
-from pgdm.envs.film import film_expert, film_motion
+from pgdm.envs.film import film_expert, film_motion, film_reach
 from pgdm.errors import ConfigError
 from pgdm.experiment import env_builder
 from pgdm.library import ensure, ensure_expert
 from pgdm.library.expert_index import ExpertEntry
+from pgdm.pregrasp.rollout import play
+from pgdm.pregrasp.sources import no_plan
 from pgdm.sim.replay import expert_marks, expert_qpos, motion_qpos
 
 _FAR_M = 0.01  # out of its limits by more than this the hand is not where methods have it
@@ -34,6 +36,28 @@ def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> No
         show_motion(builder.scene.model, motion_qpos(builder.scene, start.qpos, reference))
         return
     _say(video, film_motion(builder.make(1, 1), video))
+
+
+def view_reach(task: str, video: Path | None, pregrasp: str, offline: bool) -> None:
+    """Play the plan that leads to a start, in a window, or into an MP4.
+
+    Raises:
+        PgdmError: if the task is unknown, its assets are missing, no plan leads to the start, or
+            nothing can be drawn.
+    """
+    _check(video)
+    cfg = compose([f"task={task}", f"pregrasp={pregrasp}", "pregrasp.fallback=null"])
+    builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
+    scene, start = builder.scene, builder.mdp.start
+    if start.reach is None:
+        raise ConfigError(no_plan(start.source, scene))
+    qpos = play(scene, start.reach.actions, start.reach.qpos, builder.motion.substeps).qpos
+    if video is None:
+        from pgdm.sim.viewer import show_motion
+
+        show_motion(scene.model, qpos)
+        return
+    _say(video, film_reach(builder.make(1, 1), qpos, video))
 
 
 def view_expert(task: str, video: Path | None, offline: bool) -> None:

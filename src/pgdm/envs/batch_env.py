@@ -13,14 +13,15 @@ from torch import Tensor
 
 from pgdm.envs.divergence import History
 from pgdm.envs.finished import Finished
-from pgdm.errors import RunError, UnknownNameError
+from pgdm.errors import ConfigError, RunError, UnknownNameError
 from pgdm.mdp.actions import ActionMap
 from pgdm.mdp.context import StepContext
 from pgdm.mdp.metrics import Episodes
 from pgdm.mdp.observations import Observe
 from pgdm.mdp.recipe import Recipe
 from pgdm.motion.reference import ExpertReference, ObjectReference
-from pgdm.pregrasp.sources import StartState
+from pgdm.pregrasp.rollout import to_targets
+from pgdm.pregrasp.sources import StartState, no_plan
 from pgdm.sim.batch import SimBatch, SimState
 from pgdm.sim.randomize import Randomizer
 
@@ -74,8 +75,7 @@ class BatchEnv:
         self._t = torch.zeros(n, dtype=torch.int64)
         # Of each reward term, (2, K, N): weighted, then raw, summed over the episode.
         self._term_sums = torch.zeros(2, len(self._names), n, dtype=torch.float64)
-        # Of each measure, (2, M, N): summed over the episode's steps in which it applies, and their
-        # number.
+        # Of each measure, (2, M, N): its sum over the steps in which it applies, and their number.
         self._measured = torch.zeros(2, len(mdp.recipe.measures), n, dtype=torch.float64)
         self._pos = torch.zeros(n, horizon, 3, dtype=torch.float64)
         self._quat = torch.zeros(n, horizon, 4, dtype=torch.float64)
@@ -93,19 +93,32 @@ class BatchEnv:
     def reset(self, ids: np.ndarray | None = None) -> Tensor:
         """Restart simulations ids (k,), or all; return the observations of all, (N, D) float32."""
         ids = self._all if ids is None else ids
-        if self._randomize is not None:
-            self._randomize.apply(self.sim, ids)
-        self.sim.reset(ids, self.mdp.start.qpos, self.mdp.start.qvel)
-        rows = torch.from_numpy(ids)
-        self._t[rows] = 0
-        self._term_sums[:, :, rows] = 0.0
-        self._measured[:, :, rows] = 0.0
+        rows = self._restart(ids, self.mdp.start.qpos, self.mdp.start.qvel)
         obs, self._pos[rows, 0], self._quat[rows, 0] = self._start
         if len(ids) == self.num_envs:
             self._obs = obs.repeat(self.num_envs, 1)
         else:
             self._obs = self._obs.clone()
             self._obs[rows] = obs
+        return self._obs
+
+    def reach(self) -> Tensor:
+        """Restart all at the hand's reset pose, carry out the plan; return (N, D) where it ends.
+
+        Raises:
+            ConfigError: if no plan leads to the start.
+            RunError: if a simulation diverges on the way.
+        """
+        start, scene = self.mdp.start, self.sim.scene
+        if start.reach is None:
+            raise ConfigError(no_plan(start.source, scene))
+        self._restart(self._all, start.reach.qpos, np.zeros_like(start.qvel))
+        for ctrl in to_targets(scene.index, start.reach.actions):
+            if self.sim.step(np.tile(ctrl, (self.num_envs, 1))).any():
+                raise RunError(f"the reach of task '{scene.task.id}' diverged")
+        state = self.sim.read()
+        self._pos[:, 0], self._quat[:, 0] = state.object_pos, state.object_quat
+        self._obs = self.mdp.observe(state, self._t)
         return self._obs
 
     def step(self, action: Tensor) -> StepResult:
@@ -221,6 +234,17 @@ class BatchEnv:
         self._weights = state["weights"].clone()
         if self.mdp.recipe.measures:
             self._measured = state["measured"].clone()
+
+    def _restart(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> Tensor:
+        """Put simulations ids (k,) into a state with nothing counted yet; return their rows."""
+        if self._randomize is not None:
+            self._randomize.apply(self.sim, ids)
+        self.sim.reset(ids, qpos, qvel)
+        rows = torch.from_numpy(ids)
+        self._t[rows] = 0
+        self._term_sums[:, :, rows] = 0.0
+        self._measured[:, :, rows] = 0.0
+        return rows
 
     def _read_start(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the observation (D,) and the object's position (3,) and quaternion (4,) at reset.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pgdm.envs.batch_env import BatchEnv
 from pgdm.motion.reference import ObjectReference
-from pgdm.sim.render import Renderer, write_video
+from pgdm.sim.render import Renderer, write_image, write_video
 from pgdm.sim.replay import motion_qpos
 from pgdm.sim.scene import Scene
 
@@ -77,6 +77,28 @@ def film_motion(env: BatchEnv, path: Path) -> Path:
             for t in range(len(reference))
         )
         return write_video(path, frames, round(1 / env.sim.control_dt_s))
+
+
+def film_reach(env: BatchEnv, qpos: np.ndarray, path: Path) -> Path:
+    """Write an MP4 of the way to the pre-grasp; return its poster, where it ends.
+
+    Args:
+        env: the task, in any state.
+        qpos: joint positions (K+1, nq) at the control steps.
+        path: of the MP4.
+
+    Raises:
+        RenderError: if no OpenGL works here or the file cannot be written.
+    """
+    scene, last = env.sim.scene, len(qpos) - 1
+    with _renderer(scene, env.mdp.reference) as renderer:
+        pictures = [
+            renderer.render_qpos(row, None, f"{scene.task.id}  reach  {t}/{last}")
+            for t, row in enumerate(qpos)
+        ]
+    held = pictures[-1:] * LAST_FRAME_REPEATS
+    poster = write_video(path, [*pictures, *held], round(1 / env.sim.control_dt_s))
+    return write_image(poster, pictures[-1])
 
 
 def film_expert(

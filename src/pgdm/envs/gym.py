@@ -10,6 +10,7 @@ import torch
 from gymnasium import spaces
 
 from pgdm.envs.batch_env import BatchEnv
+from pgdm.errors import UnknownNameError
 from pgdm.sim.batch import Data, Model
 from pgdm.sim.render import Renderer
 
@@ -51,11 +52,23 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Restart the episode; ``seed`` matters only to tasks that vary per reset."""
+        """Restart the episode.
+
+        Args:
+            seed: matters only to tasks that vary per reset.
+            options: ``{"reach": True}`` begins at the hand's reset pose and carries out the plan
+                that leads to the start, as in deployment; the episode begins where it ends.
+
+        Raises:
+            ConfigError: if an option is unknown, or no plan leads to the start.
+        """
         super().reset(seed=seed)
+        asked = options or {}
+        if wrong := sorted(set(asked) - {"reach"}):
+            raise UnknownNameError("reset option", wrong[0], ["reach"])
         if seed is not None:
             self._batch.reseed(seed)
-        obs = self._batch.reset()
+        obs = self._batch.reach() if asked.get("reach") else self._batch.reset()
         return obs[0].numpy().copy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:

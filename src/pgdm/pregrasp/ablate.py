@@ -164,7 +164,7 @@ class _Ablation:
         if self._cfg.changes_start:
             qvel = start.qvel.copy()
             qvel[:nu] = 0.0
-            start = replace(start, qpos=qpos, qvel=qvel)
+            start = replace(start, qpos=qpos, qvel=qvel, reach=None)  # no plan leads here
         way = float(np.linalg.norm(qpos[:3] - self._start.qpos[:3]))
         error = float(np.abs(qpos[self._fingers] - self._goal).max())
         depth = self._contact.depth(qpos)

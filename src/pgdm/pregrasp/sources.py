@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pgdm.errors import ConfigError
-from pgdm.library import Motion, pregrasp_file
+from pgdm.library import Motion, Start, pregrasp_file
 from pgdm.sim.scene import Scene
 
 SOURCES = ("planned", "mined", "mocap", "teleop", "labeled", "learned", "none")
@@ -29,6 +29,14 @@ class PregraspCfg:
 
 
 @dataclass(frozen=True)
+class ReachStart:
+    """A plan that brings the hand to a start state, and where it begins."""
+
+    qpos: np.ndarray  # (nq,) m, rad: the hand in its reset pose, at rest
+    actions: np.ndarray  # (K, nu) in [-1, 1]
+
+
+@dataclass(frozen=True)
 class StartState:
     """State in which every episode of a task begins."""
 
@@ -36,6 +44,7 @@ class StartState:
     qpos: np.ndarray  # (nq,) m, rad
     qvel: np.ndarray  # (nv,) m/s, rad/s
     sha256: str = ""  # of the file, if it is the user's own
+    reach: ReachStart | None = None  # what leads here, if a plan is stored
 
 
 def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
@@ -68,11 +77,35 @@ def _stored(source: str, motion: Motion, scene: Scene) -> StartState | None:
     task, hand = scene.task.id, scene.hand.name
     own = pregrasp_file.find(task, hand, source)
     if own is not None:
-        return _fitting(StartState(source, own.start.qpos, own.start.qvel, own.sha256), scene)
+        reach = _reach(own.start, own.pose.qpos, scene)
+        start = StartState(source, own.start.qpos, own.start.qvel, own.sha256, reach)
+        return _fitting(start, scene)
     if source not in motion.starts:
         return None
-    start = motion.starts[source]
-    return _fitting(StartState(source, np.array(start.qpos), np.array(start.qvel)), scene)
+    stored = motion.starts[source]
+    # The plans of R begin with the objects where the mined pre-grasp has them.
+    mined = motion.starts.get("mined", stored)
+    reach = _reach(stored, mined.qpos, scene)
+    start = StartState(source, np.array(stored.qpos), np.array(stored.qvel), reach=reach)
+    return _fitting(start, scene)
+
+
+def _reach(start: Start, pose: np.ndarray, scene: Scene) -> ReachStart | None:
+    """Return the plan of a stored start, which begins with the objects where a pose has them."""
+    if start.actions is None or start.actions.shape[1] != scene.model.nu:
+        return None
+    home = np.array(pose)
+    home[: scene.model.nu] = 0.0
+    return ReachStart(home, np.array(start.actions))
+
+
+def no_plan(source: str, scene: Scene) -> str:
+    """Return what to tell who wants to see a reach that nobody planned."""
+    return (
+        f"no plan leads to the start '{source}' of task '{scene.task.id}' with hand "
+        f"'{scene.hand.name}'; make one with 'pgdm pregrasp reach {scene.task.id}' (ablated starts "
+        "and reset poses have none)"
+    )
 
 
 def _reset_pose(motion: Motion, scene: Scene) -> StartState:

@@ -37,6 +37,10 @@ class HandContact:
         self.finger_of_joint = finger[joints[self.first_finger_joint :]]
         """Number of the finger, from 0, of each finger joint."""
 
+    def finger_of_geom(self, geom: int) -> int:
+        """Return the number of the finger that a geom belongs to, -1 if to none."""
+        return int(self._finger_of_geom[geom])
+
     def depth(self, qpos: np.ndarray) -> float:
         """Return the hand's deepest penetration at qpos (nq,), m; 0 if there is none."""
         return float(self.depths(qpos).max())
