@@ -102,6 +102,13 @@ def test_a_hole_is_filled_and_said() -> None:
     assert any("filled holes with 2 faces" in repair for repair in found.repairs)
 
 
+def test_an_opening_is_as_large_as_its_lid() -> None:
+    mesh = box().apply_translation([1.0, 2.0, 3.0])
+    assert author_mesh.opening(mesh) == 0.0
+    mesh.update_faces(np.abs(mesh.face_normals[:, 2]) < 0.5)  # lid and floor are gone
+    assert author_mesh.opening(mesh) == pytest.approx(2 * 0.04 * 0.06)
+
+
 def half_shell() -> trimesh.Trimesh:
     """Return a bowl without a thickness, a third of a sphere's surface."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)

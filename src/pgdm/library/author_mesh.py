@@ -186,20 +186,35 @@ def _close(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bo
 
 def _fill(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> None:
     """Fill holes, unless the lid would make a bowl a solid."""
-    before, faces = float(mesh.area), mesh.faces.copy()
-    vertices = mesh.vertices.copy()
-    trimesh.repair.fill_holes(mesh)
-    share = float(mesh.area) / before - 1.0
+    share = opening(mesh) / float(mesh.area)
     if share > _LID_SHARE:
-        mesh.vertices, mesh.faces = vertices, faces
         if not allow_open:
             raise CorruptAssetError(
                 f"{label}: its surface is open, a lid would have {share:.0%} of its area, so its "
                 "volume is unknown; close it in the program that made it, or give --mass KG"
             )
-        repairs.append(f"left its opening open: a lid would have {share:.0%} of its surface")
-    elif filled := len(mesh.faces) - len(faces):
-        repairs.append(f"filled holes with {filled} faces, {share:.1%} of its surface")
+        repairs.append(f"left its opening open: a lid would have {share:.0%} of its area")
+        return
+    faces = len(mesh.faces)
+    trimesh.repair.fill_holes(mesh)
+    if filled := len(mesh.faces) - faces:
+        repairs.append(f"filled holes with {filled} faces, {share:.1%} of its area")
+
+
+def opening(mesh: trimesh.Trimesh) -> float:
+    """Return the area of flat lids on all holes of a surface, m2.
+
+    A closed line's area vector is half the sum of a x b over its edges, from wherever measured.
+    """
+    once = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
+    edges = mesh.edges[once]
+    if not len(edges):
+        return 0.0
+    areas = 0.5 * np.cross(mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]])
+    rims = trimesh.graph.connected_component_labels(edges, node_count=len(mesh.vertices))
+    sums = np.zeros((int(rims.max()) + 1, 3))
+    np.add.at(sums, rims[edges[:, 0]], areas)
+    return float(np.linalg.norm(sums, axis=1).sum())
 
 
 def _measured(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> SoundMesh:
