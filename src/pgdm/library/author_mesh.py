@@ -26,6 +26,7 @@ MAX_FACES = 20_000
 _THIN_M = 5e-4  # thinner things fall through the contact margin
 _OPEN_SHARE = 0.5  # of its hull that an open surface must enclose for the hull to stand for it
 _MAX_BODIES = 50
+_LID_SHARE = 0.15  # of the surface that may be filled in
 _READ_ERRORS = (
     *(ValueError, TypeError, KeyError, IndexError, AttributeError, AssertionError),
     *(NotImplementedError, ImportError, EOFError, struct.error, OSError, RuntimeError),
@@ -74,7 +75,7 @@ def read(path: Path, scale: float = 1.0, allow_open: bool = False) -> SoundMesh:
     _check_size(mesh, path.name, scale)
     _clean(mesh, path.name, repairs)
     mesh = _simplified(mesh, repairs)
-    _close(mesh, repairs)
+    _close(mesh, path.name, repairs, allow_open)
     return _measured(mesh, path.name, repairs, allow_open)
 
 
@@ -170,20 +171,50 @@ def _simplified(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
     return simple
 
 
-def _close(mesh: trimesh.Trimesh, repairs: list[str]) -> None:
+def _close(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> None:
     """Make winding and normals agree and fill holes."""
     if not mesh.is_winding_consistent:
         trimesh.repair.fix_winding(mesh)
         repairs.append("turned faces that were wound against their neighbours")
     if not mesh.is_watertight:
-        faces = len(mesh.faces)
-        trimesh.repair.fill_holes(mesh)
-        if filled := len(mesh.faces) - faces:
-            repairs.append(f"filled holes with {filled} faces")
+        _fill(mesh, label, repairs, allow_open)
     before = mesh.faces.copy()
     trimesh.repair.fix_inversion(mesh, multibody=bool(mesh.is_watertight))
     if not np.array_equal(before, mesh.faces):
         repairs.append("turned the surface inside out: it was wound inward")
+
+
+def _fill(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> None:
+    """Fill holes, unless the lid would make a bowl a solid."""
+    share = opening(mesh) / float(mesh.area)
+    if share > _LID_SHARE:
+        if not allow_open:
+            raise CorruptAssetError(
+                f"{label}: its surface is open, a lid would have {share:.0%} of its area, so its "
+                "volume is unknown; close it in the program that made it, or give --mass KG"
+            )
+        repairs.append(f"left its opening open: a lid would have {share:.0%} of its area")
+        return
+    faces = len(mesh.faces)
+    trimesh.repair.fill_holes(mesh)
+    if filled := len(mesh.faces) - faces:
+        repairs.append(f"filled holes with {filled} faces, {share:.1%} of its area")
+
+
+def opening(mesh: trimesh.Trimesh) -> float:
+    """Return the area of flat lids on all holes of a surface, m2.
+
+    A closed line's area vector is half the sum of a x b over its edges, from wherever measured.
+    """
+    once = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
+    edges = mesh.edges[once]
+    if not len(edges):
+        return 0.0
+    areas = 0.5 * np.cross(mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]])
+    rims = trimesh.graph.connected_component_labels(edges, node_count=len(mesh.vertices))
+    sums = np.zeros((int(rims.max()) + 1, 3))
+    np.add.at(sums, rims[edges[:, 0]], areas)
+    return float(np.linalg.norm(sums, axis=1).sum())
 
 
 def _measured(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> SoundMesh:
@@ -204,7 +235,10 @@ def _measured(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open:
             "its convex hull"
         )
     if not closed:
-        share = volume / hull
+        # About its own middle: an open surface's share depends on the point it is measured from.
+        centred = mesh.copy()
+        centred.apply_translation(-mesh.vertices.mean(axis=0))
+        share = abs(float(centred.volume)) / hull
         if share < _OPEN_SHARE and not allow_open:
             raise CorruptAssetError(
                 f"{label}: its surface is open and encloses about {share:.0%} of its convex hull, "
