@@ -76,19 +76,24 @@ def collect(hand: str, progress: Progress) -> list[tuple[Scene, Example]]:
     Raises:
         LibraryError: there is none.
     """
-    library = open_library()
-    tasks = [task for task in available("task") if compose([f"task={task}"]).task.motion in
-             library.tasks()]  # fmt: skip
+    library, tasks = open_library(), available("task")
     found: list[tuple[Scene, Example]] = []
     for i, task in enumerate(tasks):
         progress("scenes", i, len(tasks))
-        cfg = compose([f"task={task}", f"hand={hand}"])
-        poses = list(_poses(library, cfg, compose([f"task={task}"]).hand.name == hand))
+        cfg = compose([f"task={task}"])
+        if cfg.task.motion not in library.tasks():
+            continue
+        is_own_hand = cfg.hand.name == hand
+        if not is_own_hand:
+            if not pregrasp_file.own(task, hand):
+                continue
+            cfg = compose([f"task={task}", f"hand={hand}"])
+        poses = list(_poses(library, cfg, is_own_hand))
         if not poses:
             continue
         scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
         for qpos in poses:
-            one = example(scene, qpos) if qpos.shape == (scene.model.nq,) else None
+            one = example(scene, qpos)
             if one is None:
                 notify(f"{task}: left out, its object hangs on something")
             else:
@@ -102,8 +107,8 @@ def collect(hand: str, progress: Progress) -> list[tuple[Scene, Example]]:
 def _poses(library: Library, cfg: ExperimentCfg, is_own_hand: bool) -> Iterator[np.ndarray]:
     starts = library.motion(cfg.task.motion).starts
     if is_own_hand and "mined" in starts:
-        yield np.array(starts["mined"].qpos)
+        yield starts["mined"].qpos
     for source in _OWN:
         own = pregrasp_file.find(cfg.task.id, cfg.hand.name, source)
         if own is not None:
-            yield np.array(own.pose.qpos)
+            yield own.pose.qpos

@@ -11,7 +11,7 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 import trimesh
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from pgdm.errors import SceneError
 from pgdm.sim.scene import Scene
@@ -48,7 +48,7 @@ def encode(points: np.ndarray) -> np.ndarray:
     Returns:
         Distances in units of :data:`BASIS_RADIUS_M`.
     """
-    return np.asarray(cKDTree(points).query(basis())[0]) / BASIS_RADIUS_M
+    return np.asarray(KDTree(points).query(basis())[0]) / BASIS_RADIUS_M
 
 
 def object_code(scene: Scene, qpos: np.ndarray) -> np.ndarray:
@@ -85,7 +85,8 @@ def surface_points(
     """
     welded = model.body_weldid == model.body_weldid[body]
     touchable = (model.geom_contype | model.geom_conaffinity) != 0
-    parts = [_part(model, data, g) for g in np.flatnonzero(welded[model.geom_bodyid] & touchable)]
+    geoms = np.flatnonzero(welded[model.geom_bodyid] & touchable).tolist()
+    parts = [_part(model, data, geom) for geom in geoms]
     if not parts:
         raise SceneError(f"body '{model.body(body).name}' has no geom to touch: no shape to encode")
     area = sum(part.area for part in parts)
