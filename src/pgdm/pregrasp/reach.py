@@ -39,7 +39,7 @@ _SETTLE_STEPS, _SETTLE_GAIN = 25, 0.3  # control steps in the air, in which serv
 _SLACK = 0.4  # share of the tolerance within which a remaining error is not corrected
 _SPEED_WEIGHT_S = 0.05  # of the joints' mean final speed, in tolerances a second
 _CHECKED = 4  # candidates of a round that are looked at for penetration
-_IMPROVED = 0.95  # of the cost that was best: more is no progress
+_IMPROVED = 0.9  # of the cost that was best: more is no progress
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class ReachCfg:
     """It ends as well once all is as it must be and this many rounds brought nothing better."""
 
 
-REACH = ReachCfg(None, 8, CemCfg(48, 8, 0.3), 40, 0.5, 0.5, 3)
+REACH = ReachCfg(None, 8, CemCfg(48, 8, 0.3), 40, 0.5, 0.6, 2)
 """The search as it is done for every task."""
 
 
