@@ -37,12 +37,13 @@ class Tab:
 
     Args:
         address: of its websocket.
+        size: of the page, pixels.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, size: tuple[int, int] = SIZE) -> None:
         self._socket: ClientConnection = connect(address, max_size=None, proxy=None)
         self._number = 0
-        width, height = SIZE
+        width, height = size
         self(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -193,13 +194,13 @@ class Chromium:
     def __init__(self, port: int) -> None:
         self._port = port
 
-    def tab(self) -> Tab:
-        """Open a new page."""
+    def tab(self, size: tuple[int, int] = SIZE) -> Tab:
+        """Open a new page; a small one is drawn sooner."""
         request = urllib.request.Request(
             f"http://{HOST}:{self._port}/json/new?about:blank", method="PUT"
         )
         with _DIRECT.open(request, timeout=START_S) as answer:
-            return Tab(json.load(answer)["webSocketDebuggerUrl"])
+            return Tab(json.load(answer)["webSocketDebuggerUrl"], size)
 
 
 def _port(file: Path) -> int:

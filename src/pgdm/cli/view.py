@@ -46,12 +46,13 @@ def view_reach(task: str, video: Path | None, pregrasp: str, offline: bool) -> N
             nothing can be drawn.
     """
     _check(video)
-    cfg = compose([f"task={task}", f"pregrasp={pregrasp}", "pregrasp.fallback=null"])
-    builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
-    scene, start = builder.scene, builder.mdp.start
-    if start.reach is None:
-        raise ConfigError(no_plan(start.source, scene))
-    qpos = play(scene, start.reach.actions, start.reach.qpos, builder.motion.substeps).qpos
+    start = f"pregrasp={pregrasp}", "pregrasp.fallback=null"
+    cfg = compose([f"task={task}", *start, f"offline={str(offline).lower()}"])
+    builder = env_builder(cfg, assets(cfg, notify))
+    scene, source, reach = builder.scene, builder.mdp.start.source, builder.mdp.start.reach
+    if reach is None:
+        raise ConfigError(no_plan(source, scene))
+    qpos = play(scene, reach.actions, reach.qpos, builder.motion.substeps).qpos
     if video is None:
         from pgdm.sim.viewer import show_motion
 

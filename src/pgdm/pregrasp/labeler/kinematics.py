@@ -15,6 +15,7 @@ TIP_TOLERANCE_M = 1e-4
 _ITERATIONS = 40
 _STEP_M = 0.02  # longest step of a fingertip towards its target: the Jacobian is only local
 _DAMPING_M = 0.004  # of the least squares: how far from singular poses it acts
+_BEYOND_WEIGHT = 1e6  # of an angle beyond its limits, against its distance from the one before
 _PULL = 0.1  # share of the way back to the pose before, where the fingertip leaves a choice
 
 
@@ -82,15 +83,15 @@ class Kinematics:
         """Return hinge angles (3,) rad of an orientation (4,), as near as possible to others."""
         x, y, z = rotations.to_euler_xyz(torch.from_numpy(quat)).numpy()
         low, high = self.low[3:6], self.high[3:6]
-        best, least = near, (np.inf, np.inf)
+        found = []
         for angles in (np.array([x, y, z]), np.array([x + np.pi, np.pi - y, z + np.pi])):
-            # Turns are counted so that each angle is nearest to the one before.
-            angles = angles + 2 * np.pi * np.round((near - angles) / (2 * np.pi))
-            beyond = float(np.abs(angles - angles.clip(low, high)).sum())
-            cost = (round(beyond, 6), float(np.abs(angles - near).sum()))
-            if cost < least:
-                best, least = angles, cost
-        return best
+            turns = angles + 2 * np.pi * np.arange(-2, 3)[:, None]  # (turns, 3), all the same
+            beyond = np.abs(turns - turns.clip(low, high))
+            costs = _BEYOND_WEIGHT * beyond + np.abs(turns - near)
+            best = costs.argmin(axis=0)
+            each = np.arange(3)
+            found.append((float(costs[best, each].sum()), turns[best, each]))
+        return min(found, key=lambda one: one[0])[1]
 
     def reach_tip(
         self, qpos: np.ndarray, finger: int, target: np.ndarray, rest: np.ndarray

@@ -51,7 +51,7 @@ class LabelPage:
         self.server = guard.open_server(port)
         self.stage = Stage(self.server, scene, self.state.kinematics, *shapes)
         self.panel = Panel(self.server, self.state, poses.available(), self._commands())
-        self.stage.on_drag(self._on_wrist, self._on_tip)
+        self.stage.on_drag(self.drag_wrist, self.drag_tip)
         self.stage.aim(self.server, start.qpos)
         self.panel.say(". ".join((f"starts from the {start.origin}", *start.notes)))
         self._show(None)
@@ -83,7 +83,7 @@ class LabelPage:
 
         state = self.state
         return Commands(
-            set_joint=self._set_joint,
+            set_joint=self.set_joint,
             preset=lambda name: self.mailbox.post(lambda: self._take(name)),
             undo=later(lambda: self._change(state.undo)),
             redo=later(lambda: self._change(state.redo)),
@@ -95,16 +95,20 @@ class LabelPage:
             solid=lambda shown: self.mailbox.post(lambda: self.stage.show_solid(shown)),
         )
 
-    def _set_joint(self, joint: int, value: float, gesture: object) -> None:
+    def set_joint(self, joint: int, value: float, gesture: object) -> None:
+        """Have a joint set, m or rad, as by a slider."""
+
         def action() -> None:
             self._change(lambda: self.state.set_joint(joint, value, gesture), joint)
 
         self.mailbox.post(action, gesture)
 
-    def _on_wrist(self, pos: np.ndarray, quat: np.ndarray, phase: str) -> None:
+    def drag_wrist(self, pos: np.ndarray, quat: np.ndarray, phase: str) -> None:
+        """Have the wrist follow its handle: (3,) m, (4,) wxyz, and start, update or end."""
         self._drag("wrist", phase, lambda g: self.state.place_wrist(pos, quat, g))
 
-    def _on_tip(self, finger: int, pos: np.ndarray, phase: str) -> None:
+    def drag_tip(self, finger: int, pos: np.ndarray, phase: str) -> None:
+        """Have a fingertip follow its handle: (3,) m, and start, update or end."""
         self._drag(finger, phase, lambda g: self.state.place_tip(finger, pos, g))
 
     def _drag(self, handle: object, phase: str, move: Callable[[object], object]) -> None:
