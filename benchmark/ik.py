@@ -23,8 +23,8 @@ import mujoco
 import numpy as np
 
 from pgdm.config.groups import available
+from pgdm.config.hands import own_hand
 from pgdm.config.store import compose
-from pgdm.experiment import own_hand
 from pgdm.library import open_library
 from pgdm.library.provide import Spoken
 from pgdm.pregrasp.ik import HandIk

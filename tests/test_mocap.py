@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from command_line import TINY, command
+from pgdm.config.hands import own_hand
 from pgdm.config.store import compose
 from pgdm.errors import ConfigError, LibraryError
-from pgdm.experiment import assets, env_builder, own_hand
+from pgdm.experiment import assets, env_builder
 from pgdm.library import open_library, pregrasp_file
 from pgdm.pregrasp import mocap, provide
 from pgdm.pregrasp.recording import Recording

@@ -11,9 +11,9 @@ from pathlib import Path
 from statistics import harmonic_mean
 from typing import Any
 
+from pgdm.config.hands import own_hand
 from pgdm.config.saved import check_run_dir, save_config
 from pgdm.config.schema import ExperimentCfg
-from pgdm.config.store import compose
 from pgdm.envs.build import EnvBuilder, EnvCfg
 from pgdm.envs.film import film_policy
 from pgdm.errors import PgdmError, RenderError, RunError, UnknownNameError
@@ -26,7 +26,6 @@ from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.rl.evaluate import Evaluator
 from pgdm.rl.trainer import Extras, Outcome, Trainer, TrainerCfg
-from pgdm.sim.scene import HandCfg
 from pgdm.stop import stoppable
 from pgdm.tracking import RunFolder, open_tracker
 from pgdm.tracking.provenance import git_revision, versions
@@ -78,12 +77,6 @@ def assets(cfg: ExperimentCfg, notify: Notify, progress: FetchProgress | None = 
     wanted = Wanted(cfg.task, cfg.hand, own_hand(cfg, library), cfg.sim, cfg.pregrasp.source)
     ensure_start(library, wanted, cfg.offline, notify, progress or Spoken(notify), threads(cfg))
     return library
-
-
-def own_hand(cfg: ExperimentCfg, library: Library) -> HandCfg:
-    """Return the hand whose joints the motion's stored starts are, whatever hand takes it up."""
-    name = library.entry(cfg.task.motion).hand
-    return cfg.hand if cfg.hand.name == name else compose([f"hand={name}"]).hand
 
 
 def threads(cfg: ExperimentCfg) -> int:

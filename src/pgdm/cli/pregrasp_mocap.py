@@ -10,9 +10,10 @@ from rich.table import Table
 
 from pgdm.cli.assets import bars
 from pgdm.cli.train import notify
+from pgdm.config.hands import own_hand
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.store import compose
-from pgdm.experiment import own_hand, threads
+from pgdm.experiment import threads
 from pgdm.library import Library, Motion, Start, ensure, pregrasp_file
 from pgdm.library.pregrasp_file import Pregrasp
 from pgdm.library.report import Progress
