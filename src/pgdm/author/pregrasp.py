@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from pgdm.errors import ConfigError
-from pgdm.library import Library, pregrasp_file
+from pgdm.library import Library, Start, figures, pregrasp_file
 from pgdm.library.motion_checks import Poses
 from pgdm.library.report import Progress
 from pgdm.mdp.actions import wrist_path
 from pgdm.motion.reference import ObjectReference
-from pgdm.pregrasp.near import poses_near
+from pgdm.pregrasp.near import NearPose, poses_near
+from pgdm.pregrasp.quality import LiftTest
 from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
 
@@ -25,6 +27,7 @@ SLACK_M, SLACK_RAD = 0.03, 0.2
 """By how much the wrist, carried rigidly with the object, may leave its range: so much the fingers
 and a policy's corrections make up for."""
 _TOUCH_M = 1e-4
+_COMPARED = 5  # poses that are tried in the simulation
 
 
 @dataclass(frozen=True)
@@ -62,12 +65,10 @@ def make_pregrasp(
         found = _from_file(Path(choice), scene, qpos)
     else:
         fingers = _fingers(choice, scene, library)
-        best = poses_near(
-            scene, qpos, fingers, reach, progress=lambda i, n: progress("pre-grasp", i, n)
-        )[0]
-        text = ", ".join(f"{1e3 * d:.0f}" for d in best.tip_distances_m)
-        notes = [f"pre-grasp: fingertips {text} mm from the object, nothing touched"]
-        found = FoundPregrasp(best.qpos, "search", notes)
+        told = partial(progress, "pre-grasp")
+        poses_found = poses_near(scene, qpos, fingers, reach, progress=told)
+        following = [pose for pose in poses_found if reach(pose.qpos) == 0.0]
+        found = _firmest(scene, following or poses_found[:1])
     if (beyond := reach(found.qpos)) > 0.0:
         raise ConfigError(
             f"the wrist cannot follow the motion: carried with the object it would leave its range "
@@ -75,6 +76,20 @@ def make_pregrasp(
             "or put the object elsewhere (place in the keyframes)"
         )
     return found
+
+
+def _firmest(scene: Scene, poses: list[NearPose]) -> FoundPregrasp:
+    """Return, of the nearest poses, the one from which most random closings lift the object."""
+    lift, still = LiftTest(scene, figures.SUBSTEPS), np.zeros(scene.model.nv)
+    rates = [lift(Start(pose.qpos, still, None)) for pose in poses[:_COMPARED]]
+    best = int(np.nanargmax(rates)) if lift.possible else 0
+    pose = poses[best]
+    tips = ", ".join(f"{1e3 * d:.0f}" for d in pose.tip_distances_m)
+    notes = [
+        f"pre-grasp: fingertips {tips} mm from the object, nothing touched; "
+        f"{rates[best]:.0%} of random closings of the hand lift it"
+    ]
+    return FoundPregrasp(pose.qpos, "search", notes)
 
 
 def wrist_beyond(scene: Scene, poses: Poses) -> Callable[[np.ndarray], float]:

@@ -89,12 +89,14 @@ def explain_expert(library: Library, task: str) -> Iterator[str]:
 def needed(library: Library, task: str, source: str) -> list[str]:
     """Return the files that describe a task, relative to the source's folder."""
     entry = library.entry(task, source)
-    return [
+    every = [
         "scene/table.xml",
         f"hands/{entry.hand}/hand.xml",
         *(f"objects/{name}/object.xml" for name in entry.objects),
         f"motions/{task}.npz",
     ]
+    # A source that is not whole takes the rest from elsewhere.
+    return [name for name in every if name in library.sources()[source].files]
 
 
 def differences(library: Library, task: str, first: str, second: str) -> Iterator[str]:

@@ -35,7 +35,7 @@ _WEIGHTS = {
     "across": 0.03,
     "posture": 0.01,  # a radian^2 of the fingers away from their posture
     "wrist": 0.01,  # a radian^2 of the wrist away from its rest
-    "beyond": 1.0,
+    "beyond": 5.0,
 }
 
 
