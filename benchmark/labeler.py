@@ -112,10 +112,11 @@ def run(chrome: Chromium, console: Console) -> dict[str, Any]:
 
 
 def take_picture(chrome: Chromium, path: Path) -> None:
-    """Write the picture of the documentation: a finger inside the object, its link red."""
+    """Write the picture of the documentation: the hand a little too low."""
     page, draft = opened("hammer-use1", "planned")
-    knuckle = page.state.kinematics.fingers[1].joints[1]
-    page.set_joint(knuckle, float(page.state.qpos[knuckle]) + 0.25, None)
+    pos, quat = page.state.kinematics.wrist_pose(page.state.qpos)
+    for phase in ("start", "update", "end"):
+        page.drag_wrist(pos - np.array([0.0, 0.0, 0.018]), quat, phase)
     page.mailbox.wait()
     tab = look_at(chrome, page)
     tab.script("document.querySelector('#webgl-software-rendering button')?.click()")
