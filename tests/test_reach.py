@@ -275,6 +275,9 @@ def test_plans_of_other_hands_and_scenes(task: str) -> None:
     assert planned(task).reached
 
 
-def test_the_search_of_every_task_is_written_down() -> None:
-    assert REACH.cem.elites < REACH.cem.population
-    assert 0 < REACH.margin < 1
+def test_a_search_that_cannot_work_is_refused() -> None:
+    REACH.check()
+    with pytest.raises(ConfigError, match="8 steps has no time to move while the last 8 hold"):
+        replace(REACH, steps=8).check()
+    with pytest.raises(ConfigError, match="4 elites of 4 candidates"):
+        replace(REACH, cem=CemCfg(4, 4, 0.3)).check()
