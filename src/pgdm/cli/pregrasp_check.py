@@ -21,7 +21,7 @@ from pgdm.library import Motion, pregrasp_file
 from pgdm.library.pregrasp_file import Pregrasp
 from pgdm.pregrasp import plans
 from pgdm.pregrasp.quality import LiftTest, Quality, quality
-from pgdm.pregrasp.reach import plan_reach
+from pgdm.pregrasp.reach import measure, plan_reach
 from pgdm.pregrasp.reach_plan import ReachPlan
 from pgdm.sim.scene import Scene
 
@@ -50,8 +50,10 @@ class _Checked:
 
     source: str
     qpos: np.ndarray  # (nq,)
-    reached: bool | None
-    """Whether a plan that leads there is stored, None if it must be looked for."""
+    plan: np.ndarray | None
+    """Actions (K, nu) of the plan that is stored, if any."""
+    target: np.ndarray
+    """What the plan leads to (nq,)."""
 
 
 def check_pregrasps(request: CheckRequest) -> None:
@@ -81,8 +83,9 @@ def check_pregrasps(request: CheckRequest) -> None:
                     rows.append(row)
                     table.add_row(*_cells(row))
     finally:  # also after Ctrl-C
-        console().print(table)
-        if request.json_file is not None:
+        if rows:
+            console().print(table)
+        if rows and request.json_file is not None:
             request.json_file.parent.mkdir(parents=True, exist_ok=True)
             with paths.replacing(request.json_file) as temp:
                 temp.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
@@ -105,8 +108,10 @@ def _rows(
         tell(i / len(found), one.source)
         measured = quality(scene, one.qpos, motion.substeps, lift)
         plan = None
-        if request.reach and one.reached is None:
-            plan = plan_reach(scene, one.qpos, motion.substeps, seed=request.seed)
+        if one.plan is not None:
+            plan = measure(scene, one.plan, one.target, motion.substeps)
+        elif request.reach:
+            plan = plan_reach(scene, one.target, motion.substeps, seed=request.seed)
         yield _row(scene, one, measured, plan)
 
 
@@ -117,16 +122,22 @@ def _stored(scene: Scene, motion: Motion, sources: Sequence[str]) -> list[_Check
         ConfigError: if there is none of what was asked for.
     """
     task, hand, nq = scene.task.id, scene.hand.name, scene.model.nq
-    planned = plans.published(motion, scene)
+    fitting = {n: start.qpos for n, start in motion.starts.items() if start.qpos.shape == (nq,)}
+    published = plans.published(motion, scene)
+    plan = None if published is None else published.actions
+    mined = fitting.get("mined")
     found = {
-        name: _Checked(name, start.qpos, True if planned and name != "learned" else None)
-        for name, start in motion.starts.items()
-        if start.qpos.shape == (nq,)
+        name: _Checked(name, qpos, plan, mined)
+        if name in ("mined", "planned") and mined is not None
+        else _Checked(name, qpos, None, qpos)
+        for name, qpos in fitting.items()
     }
     for name in pregrasp_file.own(task, hand):
         own = pregrasp_file.find(task, hand, name)
         assert own is not None
         found[name] = _own(own, pregrasp_file.path_of(task, hand, name))
+    if "mined" in found and "planned" in found:  # a plan of the user's own goes before another's
+        found["mined"] = dataclasses.replace(found["mined"], plan=found["planned"].plan)
     missing = [source for source in sources if source not in found]
     if missing or not found:
         raise ConfigError(
@@ -140,7 +151,8 @@ def _own(own: Pregrasp, path: Path | None) -> _Checked:
     """Return a pre-grasp of the user's own: of a plan where it ends, else the pose."""
     source = path.stem if path is not None else ""
     start = own.start if source == "planned" else own.pose
-    return _Checked(source, start.qpos, None if own.reached is None else True)
+    plan = None if own.reached is None else own.reached.actions
+    return _Checked(source, start.qpos, plan, own.pose.qpos)
 
 
 def _whose(file: Path, own: Pregrasp, hand: str | None) -> tuple[str, str]:
@@ -173,20 +185,20 @@ def _check_fits(one: _Checked, scene: Scene) -> None:
 def _row(scene: Scene, one: _Checked, measured: Quality, plan: ReachPlan | None) -> dict[str, Any]:
     figures = dataclasses.asdict(measured)
     figures["lift_rate"] = None if math.isnan(measured.lift_rate) else measured.lift_rate
-    reached = one.reached if plan is None else plan.reached
     row = {"task": scene.task.id, "hand": scene.hand.name, "source": one.source, **figures}
-    row |= {"plan_stored": bool(one.reached), "reachable": reached}
-    return row | ({} if plan is None else {"reach": plans.figures(plan), "why": plan.failures})
+    row |= {"plan_stored": one.plan is not None, "reachable": None, "why": []}
+    if plan is None:
+        return row
+    return row | {"reachable": plan.reached, "why": plan.failures, "reach": plans.figures(plan)}
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
     lift = row["lift_rate"]
-    if row["plan_stored"]:
-        reach = "plan stored"
-    elif row["reachable"] is None:
+    if row["reachable"] is None:
         reach = "not tried (--reach)"
     else:
-        reach = "yes" if row["reachable"] else "no: " + "; ".join(row["why"])
+        reach = "stored plan: " if row["plan_stored"] else ""
+        reach += "yes" if row["reachable"] else f"no, {'; '.join(row['why'])}"
     return [
         *(row["task"], row["hand"], row["source"], "yes" if row["free"] else "no"),
         f"{1e3 * row['depth_m']:.1f}",

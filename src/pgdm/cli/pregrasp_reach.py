@@ -58,7 +58,8 @@ def plan_reaches(request: ReachRequest) -> int:
                 table.add_row(task, *cells)
                 failed += [f"{task}: {reason}"] if reason else []
     finally:  # also after Ctrl-C: what is in the table is stored
-        console().print(table)
+        if table.row_count:
+            console().print(table)
     for line in failed:
         print(f"failed: {line}", file=sys.stderr)
     return FAILED if failed else 0

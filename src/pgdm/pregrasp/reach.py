@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pgdm import seeding
-from pgdm.errors import SceneError
+from pgdm.errors import ConfigError, SceneError
 from pgdm.pregrasp.cem import CemCfg, CrossEntropy
 from pgdm.pregrasp.reach_plan import (
     DEPTH_TOLERANCE_M,
@@ -39,7 +39,7 @@ _SETTLE_STEPS, _SETTLE_GAIN = 25, 0.3  # control steps in the air, in which serv
 _SLACK = 0.4  # share of the tolerance within which a remaining error is not corrected
 _SPEED_WEIGHT_S = 0.05  # of the joints' mean final speed, in tolerances a second
 _CHECKED = 4  # candidates of a round that are looked at for penetration
-_IMPROVED = 0.95  # of the cost that was best: more is no progress
+_IMPROVED = 0.9  # of the cost that was best: more is no progress
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,25 @@ class ReachCfg:
     patience: int
     """It ends as well once all is as it must be and this many rounds brought nothing better."""
 
+    def check(self) -> None:
+        """Check that there is time to move, and someone to learn from.
 
-REACH = ReachCfg(None, 8, CemCfg(48, 8, 0.3), 40, 0.5, 0.5, 3)
+        Raises:
+            ConfigError: if not.
+        """
+        if self.steps is not None and self.steps <= self.hold_steps:
+            raise ConfigError(
+                f"a reach of {self.steps} steps has no time to move while the last "
+                f"{self.hold_steps} hold; give it more steps"
+            )
+        if not 1 <= self.cem.elites < self.cem.population:
+            raise ConfigError(
+                f"a search with {self.cem.elites} elites of {self.cem.population} candidates "
+                "learns nothing; take at least 1, and fewer than there are"
+            )
+
+
+REACH = ReachCfg(None, 8, CemCfg(48, 8, 0.3), 40, 0.5, 0.6, 2)
 """The search as it is done for every task."""
 
 
@@ -95,6 +112,7 @@ def plan_reach(
 
     Raises:
         SceneError: if the target does not fit the scene, or the simulation always diverges.
+        ConfigError: if the search has no time to move.
     """
     began = time.monotonic()
     search = _Search(scene, np.asarray(target_qpos, float), substeps, cfg, seed, num_threads)
@@ -143,6 +161,7 @@ class _Search:
         seed: int,
         num_threads: int,
     ) -> None:
+        cfg.check()
         self._scene, self._cfg, self._goal = scene, cfg, Goal(scene, target)
         steps, population = cfg.steps or default_steps(scene), cfg.cem.population
         home = reset_pose(scene, self._goal.qpos)

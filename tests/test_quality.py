@@ -1,0 +1,161 @@
+"""Quality of pre-grasps: how hands close, where palms look, and what lifts."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from command_line import command
+from pgdm.config.store import compose
+from pgdm.errors import ConfigError
+from pgdm.library import Motion, open_library, pregrasp_file
+from pgdm.pregrasp.flexion import Flexion
+from pgdm.pregrasp.quality import FAR_M, LiftTest, fingertip_distances, quality
+from pgdm.pregrasp.rollout import reset_pose
+from pgdm.sim.scene import Scene, build_scene
+
+BOX = "dmanus-crackerbox"
+
+
+@cache
+def opened(task: str) -> tuple[Scene, Motion]:
+    cfg, library = compose([f"task={task}"]), open_library()
+    scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
+    return scene, library.motion(cfg.task.motion)
+
+
+CLOSING = {
+    "hammer-use1": "FFJ2+ FFJ1+ FFJ0+ MFJ2+ MFJ1+ MFJ0+ RFJ2+ RFJ1+ RFJ0+ "
+    "LFJ4+ LFJ2+ LFJ1+ LFJ0+ THJ1- THJ0-",
+    "dhand-cup": "FF_MCP+ FF_PIP+ FF_DIP+ MF_MCP+ MF_PIP+ MF_DIP+ PF_MCP+ PF_PIP+ PF_DIP+ "
+    "TF_MCP+ TF_PIP+ TF_DIP+",
+    BOX: "TFJ1- TFJ2+ TFJ2e+ TFJ3+ IFJ2+ IFJ3+ LFJ2+ LFJ3+",
+}
+"""Joints that bend a finger, and which end of their range is closed, as the models show."""
+
+
+@pytest.mark.usefixtures("library_home")
+@pytest.mark.parametrize("task", CLOSING)
+def test_which_way_each_hand_closes(task: str) -> None:
+    model, flexion = opened(task)[0].model, Flexion(opened(task)[0])
+    found = []
+    for i, closed in enumerate(flexion.closed):
+        if not np.isnan(closed):
+            name = model.joint(flexion.first + i).name.split("/")[1]
+            found.append(name + "-+"[int(closed == model.jnt_range[flexion.first + i, 1])])
+    assert found == CLOSING[task].split()
+
+
+@pytest.mark.usefixtures("library_home")
+@pytest.mark.parametrize("task", CLOSING)
+def test_palms_look_down_in_the_reset_pose(task: str) -> None:
+    scene, motion = opened(task)
+    flexion = Flexion(scene)
+    _, normal = flexion.palm(reset_pose(scene, motion.starts["mined"].qpos))
+    assert normal @ [0.0, 0.0, -1.0] > 0.99
+    # The third base hinge turns the hand about its own length: half a turn, and it looks up.
+    turned = reset_pose(scene, motion.starts["mined"].qpos)
+    turned[5] = np.pi
+    assert flexion.palm(turned)[1] @ [0.0, 0.0, 1.0] > 0.95
+
+
+@pytest.mark.usefixtures("library_home")
+def test_fingertips_are_as_far_as_the_object_is_moved() -> None:
+    scene, motion = opened("spheremedium-lift")
+    data = mujoco.MjData(scene.model)
+    slides = scene.model.nu, scene.model.nu + 1, scene.model.nu + 2
+
+    def far(way: tuple[float, float, float]) -> np.ndarray:
+        data.qpos[:] = motion.starts["mined"].qpos
+        data.qpos[list(slides)] += way
+        mujoco.mj_kinematics(scene.model, data)
+        return fingertip_distances(scene, data)
+
+    near = far((0.0, 0.0, 0.0))
+    assert near.shape == (5,)
+    assert (near < 0.06).all()
+    assert (near >= 0).all()
+    # Far away, a ball is 0.1 m farther when it is moved by 0.1 m.
+    gone = far((0.0, 0.3, 0.0))
+    np.testing.assert_allclose(far((0.0, 0.4, 0.0)) - gone, 0.1, atol=0.015)
+    np.testing.assert_array_equal(far((0.0, 3.0, 0.0)), FAR_M)
+
+
+@pytest.mark.usefixtures("library_home")
+def test_a_good_pregrasp_lifts_and_a_hand_far_away_does_not() -> None:
+    scene, motion = opened(BOX)
+    mined = motion.starts["mined"]
+    lift = LiftTest(scene, motion.substeps, num_policies=8, num_threads=1)
+    good = quality(scene, mined.qpos, motion.substeps, lift)
+    assert good.free
+    assert good.lift_rate >= 0.5
+    assert good.fingertip_distance_m < 0.01
+    assert good.palm_angle_rad < math.radians(30)
+    away = quality(scene, reset_pose(scene, mined.qpos), motion.substeps, lift)
+    assert away.lift_rate == 0.0
+    assert away.fingertip_distance_m > 0.1
+    other = LiftTest(scene, motion.substeps, num_policies=8, num_threads=2)
+    np.testing.assert_array_equal(lift.lifted(mined), other.lifted(mined))
+    without = quality(scene, mined.qpos, motion.substeps, None)
+    assert math.isnan(without.lift_rate)
+    with pytest.raises(ConfigError, match="another scene or speed"):
+        quality(scene, mined.qpos, motion.substeps + 1, lift)
+
+
+@pytest.mark.usefixtures("library_home")
+def test_what_cuts_into_something_is_not_free() -> None:
+    scene, motion = opened("mug-drink3")
+    found = quality(scene, motion.starts["mined"].qpos, motion.substeps, None)
+    assert not found.free
+    assert found.depth_m == pytest.approx(0.0153, abs=5e-4)
+
+
+@pytest.mark.usefixtures("library_home")
+def test_a_door_cannot_be_lifted() -> None:
+    scene, motion = opened("door-open")
+    assert math.isnan(LiftTest(scene, motion.substeps, 2)(motion.starts["mined"]))
+
+
+@pytest.mark.usefixtures("library_home")
+def test_checking_all_there_is_and_one_file(tmp_path: Path) -> None:
+    motion = opened(BOX)[1]
+    path = pregrasp_file.path_of(BOX, "dmanus", "labeled")
+    pose = motion.starts["mined"]
+    pregrasp_file.write(path, pregrasp_file.Pregrasp(pose, None, {}))
+    figures = tmp_path / "figures.json"
+    quick = "--policies", "2"
+    done = command("pgdm", "pregrasp", "check", BOX, *quick, "--json", str(figures))
+    assert done.code == 0
+    rows = json.loads(figures.read_text())
+    assert {row["source"] for row in rows} == {"mined", "planned", "labeled"}
+    by_source = {row["source"]: row for row in rows}
+    assert by_source["labeled"]["reachable"] is None
+    assert "not tried (--reach)" in done.out
+    assert by_source["mined"]["reachable"] is False  # the released plan ends 16.6 mm off
+    assert "base 16.6 mm off" in done.out
+    assert all(row["free"] for row in rows)
+    one = command("pgdm", "pregrasp", "check", str(path), *quick)
+    assert one.code == 0
+    assert "labeled" in one.out
+
+
+@pytest.mark.usefixtures("library_home")
+def test_what_cannot_be_checked_is_told(tmp_path: Path) -> None:
+    missing = command("pgdm", "pregrasp", "check", BOX, "--source", "labeled")
+    assert missing.code == 2
+    assert missing.errors[0].startswith(f"error: task '{BOX}' has no pre-grasp labeled")
+    pose = opened(BOX)[1].starts["mined"]
+    stray = tmp_path / "some" / "where" / "pose.npz"
+    pregrasp_file.write(stray, pregrasp_file.Pregrasp(pose, None, {}))
+    whose = command("pgdm", "pregrasp", "check", str(stray))
+    assert "which task and hand is it for?" in whose.errors[0]
+    wrong = pregrasp_file.path_of("hammer-use1", "adroit", "labeled")
+    pregrasp_file.write(wrong, pregrasp_file.Pregrasp(pose, None, {}))
+    misfit = command("pgdm", "pregrasp", "check", str(wrong))
+    assert "has 22 positions; the scene of task 'hammer-use1'" in misfit.errors[0]
