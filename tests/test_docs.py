@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from command_line import TINY, process
+from command_line import TINY, command, process
 from pgdm.config.store import compose
 from pgdm.config.suites import expand_tasks
 from pgdm.sweep.expand import grid
@@ -97,6 +97,74 @@ def test_recipe_for_a_suite_of_settings(tmp_path: Path) -> None:
     cfg = compose(["+experiment=fast", "task=cup-pour1"], tmp_path / "my")
     assert (cfg.action.kind, cfg.algo.name, cfg.total_frames) == ("residual", "ppo_fast", 1_000_000)
     assert cfg.task.id == "cup-pour1"
+
+
+def _author_commands(page: str, heading: str) -> list[list[str]]:
+    """Return the commands of a section that make or remove something, as words."""
+    section = (DOCS / page).read_text(encoding="utf-8").split(f"\n## {heading}\n")[1]
+    section = section.split("\n## ")[0]
+    return [
+        line.split()[1:] for line in re.findall(r"pgdm author (?:object|task) [^`\n]+", section)
+    ]
+
+
+def _run_python(file: str) -> str:
+    place = os.environ | {"PYTHONPATH": str(REPOSITORY / "src")}
+    done = subprocess.run(
+        [sys.executable, file], capture_output=True, text=True, check=False, env=place
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Search hands in a hurry: whether they are good is not asked here."""
+    from pgdm.pregrasp import near
+
+    for name, count in {"STARTS": 2, "ROUNDS": 12}.items():
+        monkeypatch.setattr(near, name, count)
+
+
+def test_recipes_for_an_object_and_its_task(
+    tmp_path: Path, library_home: Path, hurried: None
+) -> None:
+    for heading in ("An object", "A task"):
+        _follow(heading, tmp_path)
+    _run_python("wedge.py")
+    made = [
+        *_author_commands("extending.md", "An object"),
+        *_author_commands("extending.md", "A task"),
+    ]
+    assert [words[1] for words in made] == ["object", "task"]
+    for words in made:
+        outcome = command("pgdm", *words)
+        assert outcome.code == 0, outcome.err
+    run = ["task=wedge-slide", "pregrasp=mined", "action=residual", "algo=ppo_fast"]
+    done = command("pgdm-run", *run, *TINY, "--offline", "run_dir=run")
+    assert done.code == 0, done.err
+    assert command("pgdm", "author", "remove", "wedge-slide", "--yes").code == 0
+
+
+def test_recipe_for_a_pregrasp_source(tmp_path: Path, library_home: Path) -> None:
+    _follow("A pre-grasp source", tmp_path)
+    assert "deepest penetration: 0.0 mm" in _run_python("spread.py")
+    done = command(
+        "pgdm-run", "task=hammer-use1", "pregrasp=labeled", *TINY, "--offline", "run_dir=r"
+    )
+    assert done.code == 0, done.err
+
+
+@pytest.mark.slow
+def test_the_worked_example_of_authoring(tmp_path: Path, library_home: Path) -> None:
+    _follow("A worked example", tmp_path, "authoring.md")
+    _run_python("pawn.py")
+    for words in _author_commands("authoring.md", "A worked example"):
+        outcome = command("pgdm", *words)
+        assert outcome.code == 0, outcome.err
+    run = ["task=pawn-lift", "pregrasp=mined", "action=residual", "algo=ppo_fast"]
+    done = command("pgdm-run", *run, *TINY, "--offline", "run_dir=run")
+    assert done.code == 0, done.err
 
 
 def test_recipe_for_a_task(tmp_path: Path, library_home: Path) -> None:
