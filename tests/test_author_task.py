@@ -212,6 +212,8 @@ def test_the_animated_tasks_can_be_carried(fresh_home: Path) -> None:
 def test_an_animated_task_starts_free_and_steps(fresh_home: Path, task: str) -> None:
     import torch
 
+    from pgdm.mdp.actions import normalize
+
     library = ensure(task, offline=True)
     builder = env_builder(compose([f"task={task}", "action=residual"]), library)
     start = library.motion(task).starts["mined"]
@@ -223,8 +225,10 @@ def test_an_animated_task_starts_free_and_steps(fresh_home: Path, task: str) -> 
     )
     assert depths.max() < 1e-3
     env = builder.make(num_envs=2, num_threads=1)
-    for _ in range(10):
-        obs, reward, *_ = env.step(torch.zeros(2, env.action_dim))
+    hold = normalize(builder.scene.index, torch.from_numpy(start.qpos.copy())).float()
+    hold[: builder.scene.index.num_base_joints] = 0.0  # residual: the wrist stays by itself
+    for _ in range(8):
+        obs, reward, *_ = env.step(hold.expand(2, -1))
     # At rest the object stays under its target until the motion begins.
     assert torch.isfinite(obs).all() and (reward > 9).all()
 
