@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pgdm.errors import ConfigError
@@ -85,6 +85,7 @@ poses = st.tuples(
 )
 
 
+@settings(max_examples=40)
 @given(st.lists(poses, min_size=2, max_size=6))
 def test_it_is_at_rest_at_its_ends_smooth_and_of_unit_length(raw: list[tuple]) -> None:
     times = np.cumsum([r[0] for r in raw]) - raw[0][0]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 import trimesh
@@ -20,196 +18,13 @@ from pgdm.config.store import compose
 from pgdm.config.suites import suite
 from pgdm.errors import ConfigError, CorruptAssetError, LibraryError, PgdmError, UnknownNameError
 from pgdm.experiment import env_builder
-from pgdm.library import animated, ensure, motion_file, open_library, own, pose_file
+from pgdm.library import animated, ensure, motion_file, open_library, own
 from pgdm.library.author_object import ObjectRequest, author_object
-from pgdm.library.motion_checks import Poses, TableCheck, check_motion, slower, smoothed, speeds
+from pgdm.library.motion_checks import Poses, TableCheck, check_motion
 from pgdm.library.verify import damaged
 from pgdm.pregrasp import near
 from pgdm.sim.contact import HandContact
-
-UNTURNED = [1.0, 0.0, 0.0, 0.0]
-
-
-def line(speed: float, steps: int = 30, ease: int = 10) -> np.ndarray:
-    """Return rows (T, 7) that go along x, from rest to a speed in m/s and back."""
-    ramp = np.clip(np.arange(steps) / ease, 0, 1) * np.clip((steps - np.arange(steps)) / ease, 0, 1)
-    x = np.cumsum(0.04 * speed * ramp)
-    return np.column_stack(
-        (x - x[0], np.zeros(steps), np.full(steps, 0.05), np.tile(UNTURNED, (steps, 1)))
-    )
-
-
-def poses(rows: np.ndarray) -> Poses:
-    return Poses(rows[:, :3], rows[:, 3:])
-
-
-def test_speeds_are_those_of_a_line_and_a_turn() -> None:
-    angle = 0.1 * np.arange(5)
-    quat = np.column_stack((np.cos(angle / 2), np.zeros((5, 2)), np.sin(angle / 2)))
-    moved, turned = speeds(Poses(np.outer(np.arange(5), [0.02, 0, 0]), quat))
-    assert moved == pytest.approx(0.5) and turned == pytest.approx(2.5)
-
-
-def test_a_calm_motion_passes() -> None:
-    check_motion(poses(line(0.5)), "it")
-
-
-def turned_back() -> np.ndarray:
-    """Return rows that reach 1.2 m/s and from one step to the next go back as fast."""
-    rows = line(1.2)
-    rows[15:, 0] = 2 * rows[14, 0] - rows[15:, 0]
-    return rows
-
-
-def with_jump(at: int, by: float) -> np.ndarray:
-    rows = line(0.2)
-    rows[at:, 1] += by
-    return rows
-
-
-@pytest.mark.parametrize(
-    ("rows", "said"),
-    [
-        (line(0.2)[:5], r"5 poses \(0.2 s\); valid: 10 to 500"),
-        (with_jump(17, 0.15), "row 17 jumps: it lies 0.15 m from row 16"),
-        (line(3.0), r"moves at 3 m/s in row .*a hand follows 2.5 at most; slow it down \(--slower"),
-        (turned_back(), r"accelerates by 60 m/s2 in row .*--smooth or --slower FACTOR help"),
-        (line(0.5, 60)[12:], r"moves in its first step already, 0.5 m/s .*--smooth adds a beginn"),
-    ],
-)
-def test_what_no_hand_can_do_is_named(rows: np.ndarray, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        check_motion(poses(rows), "it")
-
-
-def test_a_turn_that_is_torn_is_a_jump_too() -> None:
-    rows = line(0.2)
-    rows[20:, 3:] = [np.cos(0.6), 0, 0, np.sin(0.6)]
-    with pytest.raises(ConfigError, match=r"row 20 jumps: it lies 1.2 rad from row 19"):
-        check_motion(poses(rows), "it")
-
-
-def test_smoothing_gives_rests_and_slowing_divides_speeds() -> None:
-    torn = poses(line(0.5, 60)[12:])
-    mended = smoothed(torn)
-    check_motion(mended, "it")
-    assert mended.pos[0] == pytest.approx(torn.pos[0], abs=1e-4)
-    assert mended.pos[-1] == pytest.approx(torn.pos[-1], abs=1e-4)
-    fast = poses(line(3.0, 60))
-    slow = slower(fast, 2.0)
-    assert len(slow.pos) == 2 * 60 - 1
-    assert speeds(slow)[0].max() == pytest.approx(speeds(fast)[0].max() / 2, rel=0.02)
-    with pytest.raises(ConfigError, match=r"--slower is 0.5; valid: 1 to 20"):
-        slower(fast, 0.5)
-
-
-TABLE = """<mujoco><worldbody><body name="object"><joint type="slide" axis="1 0 0"/>
-<joint type="slide" axis="0 1 0"/><joint type="slide" axis="0 0 1"/><joint axis="1 0 0"/>
-<joint axis="0 1 0"/><joint axis="0 0 1"/><geom type="{kind}" size="{size}"/></body></worldbody>
-</mujoco>"""
-
-
-@pytest.mark.parametrize(
-    ("kind", "size", "half"),
-    [
-        # Turned by 45 degrees about x: half the height of each.
-        ("box", "0.02 0.03 0.04", 0.07 / np.sqrt(2)),
-        ("sphere", "0.05", 0.05),
-        ("cylinder", "0.03 0.04", 0.07 / np.sqrt(2)),
-        ("capsule", "0.03 0.04", 0.03 + 0.04 / np.sqrt(2)),
-        ("ellipsoid", "0.02 0.03 0.04", 0.05 / np.sqrt(2)),
-    ],
-)
-def test_the_lowest_point_counts(kind: str, size: str, half: float) -> None:
-    model = mujoco.MjModel.from_xml_string(TABLE.format(kind=kind, size=size))
-    table = TableCheck(model, model.body("object").id)
-    heights = half + np.array([0.01, 0.0, -0.02, 0.01])
-    turned = [np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0]
-    motion = Poses(np.outer(heights, [0, 0, 1]), np.tile(turned, (4, 1)))
-    assert table.depths(motion) == pytest.approx([0, 0, 0.02, 0], abs=1e-9)
-    with pytest.raises(ConfigError, match=r"20 mm below the table in row 2 \(1 rows in all\)"):
-        table.check(motion, "it")
-    table.check(table.lifted(motion), "it")
-
-
-def test_poses_come_from_csv_json_and_npz() -> None:
-    rows = line(0.2)
-    times = 0.02 * np.arange(30)
-    header = "time,x,y,z,qw,qx,qy,qz"
-    np.savetxt("a.csv", rows, delimiter=",")
-    np.savetxt("b.csv", np.column_stack((times, rows)), delimiter=",", header=header, comments="")
-    Path("c.json").write_text(json.dumps(rows.tolist()))
-    Path("d.json").write_text(json.dumps({"poses": rows.tolist(), "time": times.tolist()}))
-    np.savez("e.npz", object=rows, time=times)
-    np.savez("f.npz", object_translation=rows[:, :3], object_orientation=rows[:, 3:])
-    for name in ("a.csv", "c.json", "f.npz"):
-        found = pose_file.read(Path(name))
-        assert found.pos == pytest.approx(rows[:, :3]) and found.repairs == []
-    for name in ("b.csv", "d.json", "e.npz"):  # recorded at 50 Hz: every second row
-        found = pose_file.read(Path(name))
-        assert found.pos == pytest.approx(rows[::2, :3], abs=1e-9)
-        assert found.repairs == ["resampled 30 rows over 0.58 s to 15, 0.04 s apart"]
-
-
-def test_quaternions_a_little_off_are_normalised_and_said() -> None:
-    rows = line(0.2)
-    rows[:, 3:] *= 1.001
-    rows[7, 3:] *= -1
-    found = pose_file.resampled(rows, None, "it")
-    assert found.quat == pytest.approx(np.tile(UNTURNED, (30, 1)))
-    assert "normalised quaternions, whose norms were up to 0.001 off 1" in found.repairs
-
-
-def changed(row: int, column: int, value: float) -> np.ndarray:
-    rows = line(0.2)
-    rows[row, column] = value
-    return rows
-
-
-@pytest.mark.parametrize(
-    ("rows", "times", "said"),
-    [
-        (changed(4, 2, np.nan), None, "row 4 has a NaN or infinite value"),
-        (changed(9, 3, 0.4), None, "row 9 has a quaternion of norm 0.4, not a unit one"),
-        (line(0.2)[:, :6], None, r"poses have shape \(30, 6\), expected \(N, 7\)"),
-        (line(0.2)[:1], None, r"poses have shape \(1, 7\)"),
-        (line(0.2), np.r_[0:29, 28.0] * 0.04, r"row 29 has time 1.12 s, not after 1.12 s"),
-        (line(0.2), np.arange(29.0), "has 29 finite times for 30 rows"),
-    ],
-)
-def test_rows_that_are_no_poses_are_named(
-    rows: np.ndarray, times: np.ndarray | None, said: str
-) -> None:
-    with pytest.raises(CorruptAssetError, match=said):
-        pose_file.resampled(rows, times, "it")
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        ("a.csv", b"1,2,3\n", "rows have 3 columns, expected 7"),
-        ("a.csv", b"", "rows have no columns"),
-        ("a.csv", b"0,0,0,1,0,0,0\n0,0,x,1,0,0,0\n", "row 1 has 'x', not a number"),
-        ("a.json", b"{}", "lacks 'poses'"),
-        ("a.json", b"[1,", "cannot be read as poses"),
-        ("a.npz", b"zip", "not a readable .npz"),
-    ],
-)
-def test_files_that_are_none_are_named(name: str, content: bytes, said: str) -> None:
-    Path(name).write_bytes(content)
-    with pytest.raises(CorruptAssetError, match=said):
-        pose_file.read(Path(name))
-
-
-def test_formats_and_missing_files_are_named() -> None:
-    np.savez("a.npz", x=1)
-    with pytest.raises(CorruptAssetError, match=r"has neither 'poses', 'object' nor .*it has x"):
-        pose_file.read(Path("a.npz"))
-    with pytest.raises(ConfigError, match=r"format '.bag' is not read; valid: .csv, .npz, .json"):
-        pose_file.read(Path("a.bag"))
-    with pytest.raises(ConfigError, match="there is no such file"):
-        pose_file.read(Path("none.csv"))
-
+from recorded_poses import line
 
 LIFT = """keyframes:
   - {time_s: 0}
@@ -397,6 +212,8 @@ def test_the_animated_tasks_can_be_carried(fresh_home: Path) -> None:
 def test_an_animated_task_starts_free_and_steps(fresh_home: Path, task: str) -> None:
     import torch
 
+    from pgdm.mdp.actions import normalize
+
     library = ensure(task, offline=True)
     builder = env_builder(compose([f"task={task}", "action=residual"]), library)
     start = library.motion(task).starts["mined"]
@@ -408,8 +225,10 @@ def test_an_animated_task_starts_free_and_steps(fresh_home: Path, task: str) -> 
     )
     assert depths.max() < 1e-3
     env = builder.make(num_envs=2, num_threads=1)
-    for _ in range(10):
-        obs, reward, *_ = env.step(torch.zeros(2, env.action_dim))
+    hold = normalize(builder.scene.index, torch.from_numpy(start.qpos.copy())).float()
+    hold[: builder.scene.index.num_base_joints] = 0.0  # residual: the wrist stays by itself
+    for _ in range(8):
+        obs, reward, *_ = env.step(hold.expand(2, -1))
     # At rest the object stays under its target until the motion begins.
     assert torch.isfinite(obs).all() and (reward > 9).all()
 

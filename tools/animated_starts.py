@@ -35,12 +35,11 @@ def find(task: str, pictures: Path) -> None:
     content = yaml.safe_load(text)
     content.pop("start", None)
     hand, name = content.pop("hand"), content.pop("object")
-    pregrasp = content.pop("fingers", "mean")
     with tempfile.TemporaryDirectory() as folder:
         keyframes = Path(folder) / f"{task}.yaml"
         keyframes.write_text(yaml.safe_dump(content), encoding="utf-8")
         motion = MotionRequest(keyframes, None)
-        request = TaskRequest(task, name, hand, motion, pregrasp)
+        request = TaskRequest(task, name, hand, motion)
         library = open_library()
         entry = TaskEntry(hand, [name], 0, ["mined"])
         scene = task_scene(request, library.promising(task, entry))
@@ -48,7 +47,7 @@ def find(task: str, pictures: Path) -> None:
         made = make_motion(motion, library.object_xml(name), scene.model, body)
     qpos = np.zeros(scene.model.nq)
     qpos[scene.model.nu :] = object_joints(scene.model, body, made.poses)[0]
-    found = make_pregrasp(pregrasp, scene, qpos, made.poses, library, lambda *_: None)
+    found = make_pregrasp(request.pregrasp, scene, qpos, made.poses, library, lambda *_: None)
     print(task, *made.notes, *found.notes, sep="\n  ")
     nu = scene.model.nu
     start = {"hand": found.qpos[:nu], "object": found.qpos[nu:]}

@@ -140,16 +140,8 @@ class Renderer:
         return self.render(self._data, goal, caption, marks)
 
     def look(self, lookat: np.ndarray, distance: float, azimuth: float, elevation: float) -> None:
-        """Place the camera.
-
-        Args:
-            lookat: the point it looks at, (3,) m, world frame.
-            distance: from there, m.
-            azimuth: direction of view around the vertical, degrees; 90 looks along +y.
-            elevation: direction of view above the horizontal, degrees.
-        """
-        self._camera.lookat[:] = lookat
-        self._camera.distance = distance
+        """Place the camera: at a distance, m, from a point (3,) m; direction of view in degrees."""
+        self._camera.lookat[:], self._camera.distance = lookat, distance
         self._camera.azimuth, self._camera.elevation = azimuth, elevation
 
     def close(self) -> None:
