@@ -226,6 +226,9 @@ def test_plans_are_stored_found_and_kept() -> None:
     np.testing.assert_array_equal(own.reached.qpos, planned(EASY).state.qpos)
     assert own.note["reach"]["reached"] is True
     np.testing.assert_array_equal(own.pose.qpos, opened(EASY)[1].starts["mined"].qpos)
+    # The same command again goes on where it was stopped: what it made is not made again.
+    again = command("pgdm", "pregrasp", "reach", EASY, "--replace")
+    assert "own plan kept (this search made it)" in again.out
 
 
 @pytest.mark.usefixtures("library_home")
