@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -226,6 +230,9 @@ def test_plans_are_stored_found_and_kept() -> None:
     np.testing.assert_array_equal(own.reached.qpos, planned(EASY).state.qpos)
     assert own.note["reach"]["reached"] is True
     np.testing.assert_array_equal(own.pose.qpos, opened(EASY)[1].starts["mined"].qpos)
+    # The same command again goes on where it was stopped: what it made is not made again.
+    again = command("pgdm", "pregrasp", "reach", EASY, "--replace")
+    assert "own plan kept (this search made it)" in again.out
 
 
 @pytest.mark.usefixtures("library_home")
@@ -266,6 +273,31 @@ def test_a_plan_is_filmed(tmp_path: Path) -> None:
     assert film.stat().st_size > 10_000
     none = command("pgdm", "view", EASY, "--reach", "--pregrasp", "mined", "--video", str(film))
     assert none.errors[0].startswith(f"error: no plan leads to the start 'mined' of task '{EASY}'")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("library_home")
+def test_a_stopped_command_keeps_what_is_done() -> None:
+    code = "import sys; from pgdm.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    words = "pregrasp", "reach", EASY, "mug-drink3", "--replace"
+    running = subprocess.Popen(
+        [sys.executable, "-c", code, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    path = pregrasp_file.path_of(EASY, "adroit", "planned")
+    for _ in range(600):
+        if path.is_file() or running.poll() is not None:
+            break
+        time.sleep(0.1)
+    time.sleep(1)  # until it is in the table as well
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert "the plans in the table are stored" in err
+    assert f"{EASY}  stored" in out
+    assert pregrasp_file.own(EASY, "adroit") == ["planned"]
 
 
 @pytest.mark.slow

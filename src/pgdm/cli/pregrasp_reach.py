@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from rich.table import Table
 
-from pgdm.cli.errors import FAILED
+from pgdm.cli.errors import FAILED, INTERRUPTED
 from pgdm.cli.pregrasp_scenes import Tell, composed, console, each, open_scene
 from pgdm.config.suites import expand_tasks
 from pgdm.errors import PgdmError, UnknownNameError
 from pgdm.library import pregrasp_file
 from pgdm.pregrasp import plans
-from pgdm.pregrasp.reach import plan_reach
+from pgdm.pregrasp.reach import REACH, plan_reach
 from pgdm.pregrasp.reach_plan import ReachPlan
 from pgdm.sim.scene import Scene
 
@@ -57,23 +57,26 @@ def plan_reaches(request: ReachRequest) -> int:
                     cells, reason = ["failed"], str(error)
                 table.add_row(task, *cells)
                 failed += [f"{task}: {reason}"] if reason else []
-    finally:  # also after Ctrl-C: what is in the table is stored
-        if table.row_count:
-            console().print(table)
+        code = FAILED if failed else 0
+    except KeyboardInterrupt:
+        print(
+            "stopped; the plans in the table are stored, the same command goes on", file=sys.stderr
+        )
+        code = INTERRUPTED
+    if table.row_count:
+        console().print(table)
     for line in failed:
         print(f"failed: {line}", file=sys.stderr)
-    return FAILED if failed else 0
+    return code
 
 
 def _one(task: str, request: ReachRequest, tell: Tell) -> tuple[list[str], str]:
     """Return a task's cells, and why it failed if it did."""
     scene, motion = open_scene(task, request.hand, request.offline)
     target = plans.pose_of(request.source, motion, scene)
-    if not request.replace:
-        if request.source == "mined" and plans.published(motion, scene) is not None:
-            return ["published plan kept (--replace makes one of your own)"], ""
-        if _is_planned(scene, request.source, target):
-            return ["own plan kept (--replace makes it anew)"], ""
+    kept = _kept(request, scene, target, plans.published(motion, scene) is not None)
+    if kept:
+        return [kept], ""
 
     def progress(done: int, total: int, cost: float) -> None:
         tell(done / total, f"round {done} of {total} at most, cost {cost:.1f}")
@@ -81,15 +84,29 @@ def _one(task: str, request: ReachRequest, tell: Tell) -> tuple[list[str], str]:
     plan = plan_reach(scene, target, motion.substeps, seed=request.seed, progress=progress)
     if not plan.reached:
         return ["not reached", *_figures(plan)], "; ".join(plan.failures)
-    plans.store(scene, request.source, target, plan)
+    plans.store(scene, request.source, target, plan, {"reach_search": _search(request)})
     return ["stored", *_figures(plan)], ""
 
 
-def _is_planned(scene: Scene, source: str, target: np.ndarray) -> bool:
-    """Return whether a plan to this pre-grasp is there, so that a stopped command goes on."""
-    name = "planned" if source == "mined" else source
+def _kept(request: ReachRequest, scene: Scene, target: np.ndarray, published: bool) -> str:
+    """Return why nothing is to be planned, or nothing if something is.
+
+    What this very search has found before is kept in any case, so that a stopped command goes on.
+    """
+    name = "planned" if request.source == "mined" else request.source
     own = pregrasp_file.find(scene.task.id, scene.hand.name, name)
-    return own is not None and own.reached is not None and np.array_equal(own.pose.qpos, target)
+    if own is not None and own.reached is not None and np.array_equal(own.pose.qpos, target):
+        if own.note.get("reach_search") == _search(request):
+            return "own plan kept (this search made it)"
+        return "" if request.replace else "own plan kept (--replace makes it anew)"
+    if request.source == "mined" and published and not request.replace:
+        return "published plan kept (--replace makes one of your own)"
+    return ""
+
+
+def _search(request: ReachRequest) -> str:
+    """Return what a plan depends on besides its target."""
+    return f"seed {request.seed}, {REACH}"
 
 
 def _figures(plan: ReachPlan) -> list[str]:

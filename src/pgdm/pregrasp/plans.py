@@ -48,7 +48,13 @@ def published(motion: Motion, scene: Scene) -> Start | None:
     return start
 
 
-def store(scene: Scene, source: str, target: np.ndarray, plan: ReachPlan) -> Path:
+def store(
+    scene: Scene,
+    source: str,
+    target: np.ndarray,
+    plan: ReachPlan,
+    note: Mapping[str, Any] | None = None,
+) -> Path:
     """Write a plan to the user's own pre-grasps, and return the file.
 
     A plan that leads to the mined pre-grasp becomes the user's ``planned``; one that leads to a
@@ -59,6 +65,7 @@ def store(scene: Scene, source: str, target: np.ndarray, plan: ReachPlan) -> Pat
         source: of the pre-grasp, of :data:`TARGETS`.
         target: whole scene (nq,) with the hand at its pre-grasp.
         plan: that leads there.
+        note: what else to write down, plain JSON.
 
     Raises:
         OSError: if it cannot be written.
@@ -69,8 +76,8 @@ def store(scene: Scene, source: str, target: np.ndarray, plan: ReachPlan) -> Pat
     if own is None:
         own = Pregrasp(Start(target, np.zeros(scene.model.nv), None), None, {"source": source})
     path = pregrasp_file.path_of(task, hand, name)
-    note = dict(own.note) | {"reach": figures(plan)}
-    pregrasp_file.write(path, replace(own, reached=plan.state, note=note))
+    whole = {**own.note, **(note or {}), "reach": figures(plan)}
+    pregrasp_file.write(path, replace(own, reached=plan.state, note=whole))
     return path
 
 
