@@ -2,7 +2,7 @@
 
 With some 40 pre-grasps the exact answer of ridge regression, its penalty chosen on objects that
 were held out, predicts better than networks trained by gradient descent
-(``benchmark/predictor.py``). The spread is that of its errors on held-out objects.
+(``benchmark/predictor_networks.py``). The spread is that of its errors on held-out objects.
 """
 
 from __future__ import annotations
