@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -84,7 +84,10 @@ def run(setting: str, folder: Path) -> int:
 def store(found: RunFolder, target: Path) -> None:
     """Keep what a report needs of a run."""
     target.mkdir(parents=True, exist_ok=True)
-    shutil.copy(found.path / CONFIG, target)
+    where = f"run_dir: {target.relative_to(RESULTS)}"  # not a path of the machine it ran on
+    config = (found.path / CONFIG).read_text(encoding="utf-8")
+    config = re.sub(r"^run_dir: .*$", where, config, flags=re.MULTILINE)
+    (target / CONFIG).write_text(config, encoding="utf-8")
     (target / RESULT).write_text(json.dumps({**found.result, "video": None}, indent=1) + "\n")
     (target / FILE_NAME).unlink(missing_ok=True)
     log = RunLog(target / FILE_NAME)
@@ -113,8 +116,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{stored} of {sum(len(tasks) for tasks, _ in SETTINGS.values())} runs are stored")
     if stored:
         pgdm = str(Path(sys.executable).with_name("pgdm"))
-        command = [pgdm, "report", str(RESULTS / "runs"), "--out", str(RESULTS / "report")]
-        codes.append(subprocess.run(command).returncode)
+        # From there, as the page names the folders that it was given.
+        command = [pgdm, "report", "runs", "--out", "report"]
+        codes.append(subprocess.run(command, cwd=RESULTS).returncode)
     if any(codes):
         raise SystemExit(f"something failed (exit codes {codes}); the same command goes on")
 
