@@ -444,8 +444,11 @@ def test_a_start_that_is_not_stored(home: Path) -> None:
 
 
 def test_a_hand_that_does_not_fit_the_stored_start(home: Path) -> None:
-    outcome = command("pgdm-run", "--offline", *TINY, "hand=dhand", "run_dir=run")
-    assert_helps(outcome, "hammer-use1", code=2)
+    wrong = command("pgdm-run", "--offline", *TINY, "hand=dhand", "pregrasp=mined", "run_dir=run")
+    assert_helps(wrong, "hammer-use1", "pregrasp=planned", code=2)
+    # A start that fits is made from the human hand, which is not in this library.
+    alone = command("pgdm-run", "--offline", *TINY, "hand=dhand", "run_dir=run")
+    assert_helps(alone, "hammer-use1", "pgdm assets fetch", code=1)
 
 
 def test_a_checkpoint_of_another_task(home: Path, tmp_path: Path) -> None:

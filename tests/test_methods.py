@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,9 @@ from pgdm.envs.build import EnvBuilder
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.experiment import env_builder
 from pgdm.library import Expert, Library, open_library
-from pgdm.methods import METHODS, recipe
+from pgdm.mdp.measures import HAND_MEASURES
+from pgdm.mdp.recipe import Measure
+from pgdm.methods import METHODS, pgdm, recipe
 from pgdm.tracking.run_log import RunLog
 
 PGDM = {"tracking", "lift"}
@@ -162,6 +165,14 @@ def test_the_expert_is_clipped_and_its_contacts_are_seen_from_the_centre_of_mass
     # The made-up contact points are the origin of the object's body, wherever it lies.
     origin = torch.from_numpy(env.sim.data(0).xpos[index.object_body].copy())
     torch.testing.assert_close(context.contact_points[0], origin.expand(5, 3))
+
+
+def test_measures_of_ones_own_stay_beside_those_of_the_expert() -> None:
+    own = Measure("height_m", lambda step: step.start_height)
+    base = replace(pgdm.recipe(compose(["task=hammer-use1"]).method), measures=(own,))
+    made = base.comparing(HAND_MEASURES).comparing(HAND_MEASURES)
+    assert made.measures == (own, *HAND_MEASURES)
+    assert made.needs_expert and not base.needs_expert
 
 
 def test_measures_of_an_episode_are_means_over_the_steps_they_apply_to(library_home: Path) -> None:

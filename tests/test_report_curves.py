@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 
-from pgdm.report.curves import curves, mean_curve
+from pgdm.report import figures
+from pgdm.report.curves import _scale, curves, mean_curve
 from pgdm.report.results import Results
 from pgdm.report.runs import ERROR, SUCCESS, read_run
 from report_runs import FRAMES, make
@@ -54,3 +55,23 @@ def test_every_task_has_its_panel(tmp_path: Path, metric: str) -> None:
     assert len(sizes) == 1
     with Image.open(tmp_path / "all.png") as whole:
         assert whole.width == 5 * sizes.pop()[0]
+
+
+def test_a_short_curve_keeps_its_colour(tmp_path: Path) -> None:
+    results_ = results(tmp_path, "cup-pour1", "duck-lift")
+    other = make(tmp_path / "short", 0.9, "task=cup-pour1", "action=residual")
+    run = read_run(other)
+    run.evaluations.update({name: values[:2] / 8 for name, values in run.evaluations.items()})
+    made = Results([*results_.runs, run])
+    curves(made, SUCCESS, tmp_path / "all.png", lambda *_: None)
+    wanted = {ImageColor.getrgb(figures.colour(made, setting)) for setting in made.settings}
+    assert len(wanted) == 2
+    with Image.open(tmp_path / "all.png") as whole:
+        drawn = {colour for _, colour in whole.convert("RGB").getcolors(1 << 16) or []}
+    assert wanted <= drawn
+
+
+def test_panels_end_above_the_best_success(tmp_path: Path) -> None:
+    for best, end in ((0.07, 0.1), (0.15, 0.2), (0.4, 0.5), (0.6, 1.0)):
+        made = Results([read_run(make(tmp_path / f"{best}", best, "task=cup-pour1"))])
+        assert _scale(made, SUCCESS).high == end

@@ -210,6 +210,17 @@ def test_choice_of_opengl(
     assert done.stderr == ""  # nothing left for the interpreter's end to complain about
 
 
+def test_compiler_for_gpus_is_loaded_before_opengl(tmp_path: Path) -> None:
+    (tmp_path / "triton.py").write_text(
+        "import sys\n"
+        "assert not {'mujoco.egl', 'mujoco.osmesa', 'OpenGL'} & set(sys.modules)\n"
+        "print('triton first')\n"
+    )
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    done = chosen(PYTHONPATH=path)
+    assert done.stdout.startswith("triton first"), done.stderr
+
+
 def test_unusable_choice_is_an_error() -> None:
     env = {"MUJOCO_GL": "glfw", "DISPLAY": ":77", "WAYLAND_DISPLAY": "none"}
     done = chosen(**env)

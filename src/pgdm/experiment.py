@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import harmonic_mean
 from typing import Any
 
+from pgdm.config.hands import own_hand
 from pgdm.config.saved import check_run_dir, save_config
 from pgdm.config.schema import ExperimentCfg
 from pgdm.envs.build import EnvBuilder, EnvCfg
@@ -20,6 +21,7 @@ from pgdm.library import Library, ensure, ensure_expert
 from pgdm.library.provide import Spoken
 from pgdm.library.report import Progress as FetchProgress
 from pgdm.methods import recipe
+from pgdm.pregrasp.provide import Wanted, ensure_start
 from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.rl.evaluate import Evaluator
@@ -62,15 +64,18 @@ def env_builder(cfg: ExperimentCfg, library: Library) -> EnvBuilder:
 
 
 def assets(cfg: ExperimentCfg, notify: Notify, progress: FetchProgress | None = None) -> Library:
-    """Open the library with all that an experiment needs in it; fetches what is missing.
+    """Open the library with all that an experiment needs in it; fetches or makes what is missing.
 
     Raises:
         LibraryError: if something is missing and cannot be fetched.
+        ConfigError: if the start cannot be made for this hand.
     """
     library = ensure(cfg.task.motion, cfg.offline, notify, progress=progress)
     if recipe(cfg.method).needs_expert:
         with suppress(UnknownNameError):  # `env_builder` says which tasks have an expert
-            ensure_expert(cfg.task.motion, cfg.offline, notify, progress=progress)
+            library = ensure_expert(cfg.task.motion, cfg.offline, notify, progress=progress)
+    wanted = Wanted(cfg.task, cfg.hand, own_hand(cfg, library), cfg.sim, cfg.pregrasp.source)
+    ensure_start(library, wanted, cfg.offline, notify, progress or Spoken(notify), threads(cfg))
     return library
 
 

@@ -63,6 +63,8 @@ def make_batch(
     chosen = [f"{group}={option}" for group, option in choices.items()]
     cfg = compose([f"task={task}", f"offline={str(offline).lower()}", *chosen, *overrides])
     builder = env_builder(cfg, assets(cfg, _log.warning))
+    for note in builder.notes:
+        _log.warning(note)
     return builder.make(num_envs, num_threads, seed, auto_reset=auto_reset)
 
 

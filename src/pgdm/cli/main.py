@@ -123,8 +123,8 @@ def view(
         Path | None, typer.Option(help="Write an MP4 to this file instead of opening a window.")
     ] = None,
     pregrasp: Annotated[
-        str, typer.Option(help="Start state that shows the hand: planned, mined, learned or none.")
-    ] = "planned",
+        str | None, typer.Option(help="Start that shows the hand, as in pgdm-run [planned].")
+    ] = None,
     expert: Annotated[
         bool,
         typer.Option("--expert", help="Move the hand as a person's moved; spheres show contacts."),
@@ -148,13 +148,16 @@ def view(
         raise ConfigError("--ablations and --image FILE go together, without --video or --expert")
     if reach and (ablations or expert):
         raise ConfigError("--reach goes without --ablations and --expert")
+    if expert and pregrasp is not None:
+        raise ConfigError("--expert shows the hand as it moved: leave --pregrasp out")
+    start = pregrasp or "planned"
     if ablations:
-        return view_ablations(task, image, pregrasp, offline)
+        return view_ablations(task, image, start, offline)
     if reach:
-        return view_reach(task, video, pregrasp, offline)
+        return view_reach(task, video, start, offline)
     if expert:
         return view_expert(task, video, offline)
-    return view_task(task, video, pregrasp, offline)
+    return view_task(task, video, start, offline)
 
 
 @app.command("report")

@@ -8,8 +8,8 @@ from pgdm.cli.train import notify
 from pgdm.config.store import compose
 from pgdm.envs.film import film_expert, film_motion, film_reach
 from pgdm.errors import ConfigError
-from pgdm.experiment import env_builder
-from pgdm.library import ensure, ensure_expert
+from pgdm.experiment import assets, env_builder
+from pgdm.library import ensure_expert
 from pgdm.library.expert_index import ExpertEntry
 from pgdm.pregrasp.rollout import play
 from pgdm.pregrasp.sources import no_plan
@@ -25,8 +25,8 @@ def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> No
         PgdmError: if the task is unknown, its assets are missing, or nothing can be drawn.
     """
     _check(video)
-    cfg = compose([f"task={task}", f"pregrasp={pregrasp}"])
-    builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
+    cfg = compose([f"task={task}", f"pregrasp={pregrasp}", f"offline={str(offline).lower()}"])
+    builder = env_builder(cfg, assets(cfg, notify))
     start, reference = builder.mdp.start, builder.mdp.reference
     for note in builder.notes:
         notify(note)
@@ -46,12 +46,13 @@ def view_reach(task: str, video: Path | None, pregrasp: str, offline: bool) -> N
             nothing can be drawn.
     """
     _check(video)
-    cfg = compose([f"task={task}", f"pregrasp={pregrasp}", "pregrasp.fallback=null"])
-    builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
-    scene, start = builder.scene, builder.mdp.start
-    if start.reach is None:
-        raise ConfigError(no_plan(start.source, scene))
-    qpos = play(scene, start.reach.actions, start.reach.qpos, builder.motion.substeps).qpos
+    start = f"pregrasp={pregrasp}", "pregrasp.fallback=null"
+    cfg = compose([f"task={task}", *start, f"offline={str(offline).lower()}"])
+    builder = env_builder(cfg, assets(cfg, notify))
+    scene, source, reach = builder.scene, builder.mdp.start.source, builder.mdp.start.reach
+    if reach is None:
+        raise ConfigError(no_plan(source, scene))
+    qpos = play(scene, reach.actions, reach.qpos, builder.motion.substeps).qpos
     if video is None:
         from pgdm.sim.viewer import show_motion
 

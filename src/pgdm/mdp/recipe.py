@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -50,6 +50,11 @@ class Recipe:
     """Recorded for each episode as the mean over its steps, under their names."""
     needs_expert: bool = False
     """Whether terms or measures compare with an expert's hand trajectory."""
+
+    def comparing(self, measures: tuple[Measure, ...]) -> Recipe:
+        """Return it with measures that compare with an expert, beside those it has."""
+        new = tuple(measure for measure in measures if measure not in self.measures)
+        return replace(self, measures=(*self.measures, *new), needs_expert=True)
 
     def table(self) -> list[tuple[str, str, str]]:
         """Return what is active as rows (kind, name, weight), for people to read."""

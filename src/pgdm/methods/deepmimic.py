@@ -76,13 +76,8 @@ def add_imitation(base: Recipe, cfg: ImitationCfg) -> Recipe:
             grace_steps=cfg.grace_steps,
         )
         ends = (*ends, EndTerm("hand_lost", lost))
-    return replace(
-        base,
-        rewards=(*base.rewards, RewardTerm("imitation", cfg.weight, close)),
-        ends=ends,
-        measures=HAND_MEASURES,
-        needs_expert=True,
-    )
+    term = RewardTerm("imitation", cfg.weight, close)
+    return replace(base, rewards=(*base.rewards, term), ends=ends).comparing(HAND_MEASURES)
 
 
 def recipe(cfg: DeepMimicCfg) -> Recipe:

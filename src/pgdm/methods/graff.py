@@ -52,12 +52,8 @@ class GraffCfg(MethodCfg):
 def add_contact(base: Recipe, cfg: ContactCfg) -> Recipe:
     """Return a recipe with the contact reward."""
     near = partial(rewards.fingertip_contact, form=cfg.form, scale=cfg.scale)
-    return replace(
-        base,
-        rewards=(*base.rewards, RewardTerm("contact", cfg.weight, near)),
-        measures=HAND_MEASURES,
-        needs_expert=True,
-    )
+    term = RewardTerm("contact", cfg.weight, near)
+    return replace(base, rewards=(*base.rewards, term)).comparing(HAND_MEASURES)
 
 
 def recipe(cfg: GraffCfg) -> Recipe:

@@ -125,6 +125,7 @@ def _fitting(start: StartState, scene: Scene) -> StartState:
         raise ConfigError(
             f"start '{start.source}' of task '{scene.task.id}' has {start.qpos.size} positions and "
             f"{start.qvel.size} velocities, the scene with hand '{scene.hand.name}' has "
-            f"{model.nq} and {model.nv}; pregrasp=none starts any hand from its reset pose"
+            f"{model.nq} and {model.nv}; pregrasp=planned makes one for another hand, "
+            "pregrasp=none starts from its reset pose"
         )
     return start

@@ -30,6 +30,7 @@ _POINTS = 200  # of a mean curve at most
 _NAMES = {SUCCESS: "success", ERROR: "COM error, released form [m]"}
 _PAPER = {SUCCESS: "paper_success", ERROR: "paper_com_error"}
 _GREY = "#888888"
+_HIGHEST = (0.1, 0.2, 0.5, 1.0)  # success that panels may end at
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class _Scale:
             for power in range(round(self.low), round(self.high) + 1):
                 yield 10.0**power, f"$10^{{{power}}}$"
         else:
-            yield from ((value, f"{value:g}") for value in (0.0, 0.5, 1.0))
+            yield from ((value, f"{value:g}") for value in (0.0, self.high / 2, self.high))
 
 
 def curves(
@@ -162,9 +163,11 @@ def _frame(axes: Axes, place: Callable[[Array, Array], Array], scale: _Scale) ->
 
 def _scale(results: Results, metric: str) -> _Scale:
     furthest = max(run.evaluations["frames"].max(initial=1.0) for run in results.runs)
-    if metric == SUCCESS:
-        return _Scale(False, furthest, 0.0, 1.0)
     values = np.concatenate([run.evaluations[metric] for run in results.runs])
+    if metric == SUCCESS:
+        levels = [v for task in results.tasks for v, _ in _levels(results, task, metric)]
+        most = max([*values[np.isfinite(values)], *levels], default=1.0)
+        return _Scale(False, furthest, 0.0, next(high for high in _HIGHEST if high >= most))
     powers = np.log10(values[np.isfinite(values) & (values > 0)])
     low, high = math.floor(powers.min(initial=-1.0)), math.ceil(powers.max(initial=-2.0))
     return _Scale(True, furthest, low, max(high, low + 1))

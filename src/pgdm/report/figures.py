@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,22 +11,26 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
+from PIL import Image, ImageColor
 
 from pgdm.report.results import Results
 from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
 from pgdm.report.tables import THRESHOLDS, Average
 
-# Okabe and Ito's colours, which colour-blind people can tell apart.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F", "#000000")
+# Okabe and Ito's colours, which colour-blind people can tell apart, then darker ones.
+COLOURS = (
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F", "#000000"),
+    *("#332288", "#882255", "#999933", "#44AA99"),
+)
 DPI = 150
 _WIDTH_IN = 5.2
 _THUMB = (240, 180)  # pixels of a film's picture
+_SHADES = 12  # of a colour in a drawing: lines have soft edges
 
 
 def colour(results: Results, setting: Setting) -> str:
-    """Return a setting's colour; after eight they begin again."""
+    """Return a setting's colour; after all of them they begin again."""
     return COLOURS[results.settings.index(setting) % len(COLOURS)]
 
 
@@ -121,5 +126,20 @@ def thumbnail(poster: Path) -> bytes | None:
 def png(picture: Image.Image) -> bytes:
     """Return a drawing as PNG with few colours, a quarter of the size."""
     stream = io.BytesIO()
-    picture.quantize(64).save(stream, "PNG")
+    picture.quantize(palette=_palette(), dither=Image.Dither.NONE).save(stream, "PNG")
     return stream.getvalue()
+
+
+@functools.cache
+def _palette() -> Image.Image:
+    """Return greys and each of the colours, thinned by white in steps.
+
+    A palette made from a drawing itself leaves out what little of it a short curve is.
+    """
+    shares = np.linspace(1.0, 0.0, _SHADES, endpoint=False)[:, None, None]
+    colours = np.array([ImageColor.getrgb(c) for c in COLOURS])
+    greys = np.linspace(0, 255, _SHADES)[:, None].repeat(3, axis=1)
+    shades = (255 + shares * (colours - 255)).reshape(-1, 3)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate((greys, shades)).round().astype(np.uint8).tobytes())
+    return palette

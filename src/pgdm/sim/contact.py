@@ -47,18 +47,31 @@ class HandContact:
 
     def depths(self, qpos: np.ndarray) -> np.ndarray:
         """Return the deepest penetration of each finger, then of all else of the hand, (F+1,) m."""
+        depths = np.zeros(self.num_fingers + 1)
+        for finger, dist in zip(*self._near(qpos, 0.0), strict=True):
+            depths[finger] = max(depths[finger], -dist)
+        return depths
+
+    def overlap(self, qpos: np.ndarray, clearance_m: float) -> float:
+        """Return by how much all contacts at qpos (nq,) are closer than a clearance, summed, m.
+
+        0 means that nothing is; more clearance than the geoms' margins is not seen.
+        """
+        dist = self._near(qpos, clearance_m)[1]
+        return float((clearance_m - dist).sum())
+
+    def _near(self, qpos: np.ndarray, clearance_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return finger (-1: other parts) and distance of the contacts that are too close."""
         model, data = self._model, self._data
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
-        depths = np.zeros(self.num_fingers + 1)
-        pairs = data.contact.geom[data.contact.dist < 0]
-        for (one, two), dist in zip(pairs, data.contact.dist[data.contact.dist < 0], strict=True):
-            if self._of_hand[one] != self._of_hand[two]:
-                finger = self._finger_of_geom[one if self._of_hand[one] else two]
-                depths[finger] = max(depths[finger], -dist)
-        return depths
+        pairs, dist = data.contact.geom, data.contact.dist
+        of_hand = self._of_hand[pairs]  # (contacts, 2)
+        near = (of_hand[:, 0] != of_hand[:, 1]) & (dist < clearance_m)
+        geoms = np.where(of_hand[near, 0], pairs[near, 0], pairs[near, 1])
+        return self._finger_of_geom[geoms], dist[near]
 
     def too_near(self, data: mujoco.MjData, clearance_m: float) -> float:
         """Return by how much the hand's contacts with other things are too close in all, m.

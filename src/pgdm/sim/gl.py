@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import importlib
@@ -48,6 +49,10 @@ def context_class() -> type[Any]:
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wanted in _OFF:
         raise RenderError(f"rendering is switched off by MUJOCO_GL={wanted}; unset it to render")
+    # Mesa's software renderer brings an LLVM, and so does the compiler that torch has for GPUs:
+    # loaded after Mesa's it ends the process (Mesa 22.3, triton 3.9); before it, both work.
+    with contextlib.suppress(ImportError):
+        importlib.import_module("triton")
     if wanted or not sys.platform.startswith("linux"):
         return _load_mujocos_choice(wanted)
     reasons = []

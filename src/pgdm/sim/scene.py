@@ -80,6 +80,8 @@ class HandCfg:
     """Geoms (each in a body of the same name) whose poses are observed, in observation order."""
     fingertips: list[int]
     """Which of the points are fingertips."""
+    human_fingers: list[str]
+    """Human finger that each fingertip follows: index, middle, ring, little or thumb."""
     gravity_compensation: str
     """``all`` actuated joints are held against gravity, or only the ``base`` joints."""
     num_base_joints: int

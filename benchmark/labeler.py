@@ -1,0 +1,150 @@
+"""How many interactions a second the labeler follows, with a real page open in a browser.
+
+python benchmark/labeler.py                       writes benchmark/results/labeler.json
+python benchmark/labeler.py --picture FILE.jpg    takes the documentation's picture instead
+
+An interaction is what a page sends when a slider or a handle is moved: joints, forward
+kinematics, contacts and distances are computed, and the scene is sent to the page. The labeler
+runs on one core; the browser draws in software, without a graphics card.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from chromium import Chromium, Tab, browser
+from PIL import Image
+from rich.console import Console
+
+from pgdm.config.store import compose
+from pgdm.experiment import env_builder
+from pgdm.library import open_library
+from pgdm.pregrasp.labeler import shapes
+from pgdm.pregrasp.labeler.page import LabelPage
+from pgdm.pregrasp.labeler.store import Draft, Poses
+
+TASKS = ("hammer-use1", "dhand-cup", "dmanus-crackerbox")
+INTERACTIONS = 300
+PATIENCE_S = 120.0
+RESULT = Path(__file__).parent / "results" / "labeler.json"
+QUALITY = 82
+
+
+def opened(task: str, origin: str) -> tuple[LabelPage, Draft]:
+    """Serve a task's labeler."""
+    builder = env_builder(compose([f"task={task}", "pregrasp=none"]), open_library())
+    scene, motion = builder.scene, builder.motion
+    poses, draft = Poses(scene, motion), Draft(scene)
+    looks = shapes.visible(scene), shapes.solid(scene)
+    return LabelPage(scene, poses, poses.load(origin), draft, looks, motion.substeps, 0), draft
+
+
+def look_at(chrome: Chromium, page: LabelPage) -> Tab:
+    """Open a page and wait until hand and object are drawn."""
+    tab = chrome.tab()
+    tab.open(page.url, "fingertips to the object")
+    end = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end:
+        with Image.open(io.BytesIO(tab.picture())) as picture:
+            seen = np.asarray(picture.convert("RGB"))[200:600, 200:800].reshape(-1, 3)
+        if len(np.unique(seen // 8, axis=0)) > 100:  # an empty page has a few
+            return tab
+    raise TimeoutError("the page was not drawn")
+
+
+def moves(page: LabelPage) -> dict[str, Callable[[float], None]]:
+    """Return what a person can do, each told how far it is, from -1 to 1."""
+    state = page.state
+    pos, quat = state.kinematics.wrist_pose(state.qpos)
+    tip = state.kinematics.tip(state.qpos, 0)
+    knuckle = state.kinematics.fingers[0].joints[1]
+    height, bent = float(state.qpos[1]), float(state.qpos[knuckle])
+    up = np.array([0.0, 0.0, 1.0])
+    return {
+        "wrist slider": lambda x: page.set_joint(1, height + 0.02 * x, "wrist slider"),
+        "finger slider": lambda x: page.set_joint(knuckle, bent + 0.3 * x, "finger slider"),
+        "wrist handle": lambda x: page.drag_wrist(pos + 0.02 * x * up, quat, "update"),
+        "fingertip handle": lambda x: page.drag_tip(0, tip + 0.01 * x * up, "update"),
+    }
+
+
+def measure(page: LabelPage, move: Callable[[float], None]) -> tuple[float, float]:
+    """Return interactions a second by the clock, and by the processor's time of the labeler."""
+    began, used = time.perf_counter(), time.process_time()
+    for i in range(INTERACTIONS):
+        move(float(np.sin(0.3 * i)))
+        page.mailbox.wait()  # so that none is overtaken
+    page.server.flush()
+    clock, processor = time.perf_counter() - began, time.process_time() - used
+    return INTERACTIONS / clock, INTERACTIONS / processor
+
+
+def run(chrome: Chromium, console: Console) -> dict[str, Any]:
+    """Measure all tasks."""
+    figures: dict[str, Any] = {}
+    for task in TASKS:
+        with console.status(f"{task}: starting"):
+            page, draft = opened(task, "planned")
+            tab = look_at(chrome, page)
+        figures[task] = {}
+        for name, move in moves(page).items():
+            with console.status(f"{task}: {name}"):
+                clock, processor = measure(page, move)
+            figures[task][name] = {
+                "per_s": round(clock, 1),
+                "per_s_of_one_core": round(processor, 1),
+            }
+            console.print(f"{task} {name}: {clock:.0f}/s, {processor:.0f} a core-second")
+        tab.wait("document.body.innerText.includes('fingertips')")  # it is still there
+        tab.close()
+        page.close()
+        draft.close()
+    return figures
+
+
+def take_picture(chrome: Chromium, path: Path) -> None:
+    """Write the picture of the documentation: the hand a little too low."""
+    page, draft = opened("hammer-use1", "planned")
+    pos, quat = page.state.kinematics.wrist_pose(page.state.qpos)
+    for phase in ("start", "update", "end"):
+        page.drag_wrist(pos - np.array([0.0, 0.0, 0.018]), quat, phase)
+    page.mailbox.wait()
+    tab = look_at(chrome, page)
+    tab.script("document.querySelector('#webgl-software-rendering button')?.click()")
+    time.sleep(10.0)  # until the warning has gone, and all is drawn in full
+    with Image.open(io.BytesIO(tab.picture())) as picture:
+        picture.convert("RGB").save(path, quality=QUALITY, optimize=True)
+    page.close()
+    draft.close()
+    print(f"{path}: {path.stat().st_size // 1024} KiB")
+
+
+def main() -> None:
+    """Measure, or take the picture."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="Take the picture instead.")
+    chosen = parser.parse_args()
+    console = Console()
+    with tempfile.TemporaryDirectory() as user, browser() as chrome:
+        os.environ["PGDM_USER_DIR"] = user
+        if chosen.picture is not None:
+            return take_picture(chrome, chosen.picture)
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # of this process, not the browser
+        figures = run(chrome, console)
+    load = os.getloadavg()[0]
+    result = {"interactions": INTERACTIONS, "cores": 1, "load": round(load, 1), "tasks": figures}
+    RESULT.write_text(json.dumps(result, indent=1) + "\n")
+    print(f"wrote {RESULT}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""``pgdm pregrasp train``: a predictor of pre-grasps from all that the library has."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pgdm.cli.assets import bars
+from pgdm.cli.progress import duration
+from pgdm.cli.train import notify
+from pgdm.config.groups import available
+from pgdm.config.schema import ExperimentCfg
+from pgdm.config.store import compose
+from pgdm.errors import LibraryError, UnknownNameError
+from pgdm.library import Library, open_library, pregrasp_file
+from pgdm.library.catalog import CURE
+from pgdm.library.report import Progress
+from pgdm.pregrasp.predict import weights
+from pgdm.pregrasp.predict.grasp_vector import GraspFrame
+from pgdm.pregrasp.predict.predictor import Example, Predictor, example, fit
+from pgdm.sim.scene import Scene, build_scene
+
+_OWN = ("labeled", "mocap", "teleop")  # of the user's own pre-grasps those that a person made
+_FEW_OBJECTS = 10
+
+
+def train_predictor(hand: str, leave_out: Sequence[str], out: Path | None) -> None:
+    """Train, write and tell how good it is on objects that were held out.
+
+    Raises:
+        PgdmError: the hand or an object is unknown, or there is too little to learn from.
+    """
+    began = time.monotonic()
+    if hand not in available("hand"):
+        raise UnknownNameError("hand", hand, available("hand"))
+    with bars() as progress:
+        found = collect(hand, progress)
+        examples = [one for _, one in found]
+        objects = sorted({one.object for one in examples})
+        for name in leave_out:
+            if name not in objects:
+                raise UnknownNameError("object to leave out", name, objects)
+        kept = [one for one in examples if one.object not in leave_out]
+        frame = GraspFrame(found[0][0])
+        predictor = fit(kept, frame, leave_out, lambda i, n: progress("held-out fits", i, n))
+    path = out or weights.path_of(hand)
+    weights.write(path, predictor)
+    for line in describe(predictor, len(kept)):
+        print(line)
+    print(f"weights: {path} ({duration(time.monotonic() - began)})")
+
+
+def describe(predictor: Predictor, poses: int) -> list[str]:
+    """Return what should be known of a fresh predictor."""
+    objects = len(predictor.objects)
+    lines = [
+        f"hand {predictor.hand}: {poses} pre-grasps of {objects} objects"
+        + (f", without {', '.join(predictor.left_out)}" if predictor.left_out else ""),
+        f"on objects held out in turn the fingertips are {1e3 * predictor.error_m:.1f} mm off on "
+        f"average, the mean hand's {1e3 * predictor.mean_hand_error_m:.1f} mm",
+    ]
+    if objects < _FEW_OBJECTS:
+        lines.append(
+            f"{objects} objects are very few: expect little more than a mean hand. Pre-grasps that "
+            f"you label or retarget for this hand are learned from too"
+        )
+    return lines
+
+
+def collect(hand: str, progress: Progress) -> list[tuple[Scene, Example]]:
+    """Return every pre-grasp of a hand that can be learned from, with its scene.
+
+    Raises:
+        LibraryError: there is none.
+    """
+    library, tasks = open_library(), available("task")
+    found: list[tuple[Scene, Example]] = []
+    for i, task in enumerate(tasks):
+        progress("scenes", i, len(tasks))
+        cfg = compose([f"task={task}"])
+        if cfg.task.motion not in library.tasks():
+            continue
+        is_own_hand = cfg.hand.name == hand
+        if not is_own_hand:
+            if not pregrasp_file.own(task, hand):
+                continue
+            cfg = compose([f"task={task}", f"hand={hand}"])
+        poses = list(_poses(library, cfg, is_own_hand))
+        if not poses:
+            continue
+        scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
+        for qpos in poses:
+            one = example(scene, qpos)
+            if one is None:
+                notify(f"{task}: left out, its object hangs on something")
+            else:
+                found.append((scene, one))
+    progress("scenes", len(tasks), len(tasks))
+    if not found:
+        raise LibraryError(f"the library has no pre-grasp of hand '{hand}'. {CURE}")
+    return found
+
+
+def _poses(library: Library, cfg: ExperimentCfg, is_own_hand: bool) -> Iterator[np.ndarray]:
+    starts = library.motion(cfg.task.motion).starts
+    if is_own_hand and "mined" in starts:
+        yield starts["mined"].qpos
+    for source in _OWN:
+        own = pregrasp_file.find(cfg.task.id, cfg.hand.name, source)
+        if own is not None:
+            yield own.pose.qpos

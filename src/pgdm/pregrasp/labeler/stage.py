@@ -1,0 +1,194 @@
+"""The scene in the page: bodies that move, colours that warn, handles to drag."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+
+from pgdm.pregrasp.labeler.figures import Figures
+from pgdm.pregrasp.labeler.kinematics import Kinematics
+from pgdm.pregrasp.labeler.shapes import Shape
+from pgdm.sim.camera import camera_for
+from pgdm.sim.scene import Scene
+
+INSIDE_RGB = (222, 45, 38)
+"""Of links that cut into something."""
+_STILL = 1e-7  # m, and of a quaternion's parts: bodies that moved less are not sent again
+_ASPECT = 1.2  # of the part of the page that shows the scene
+_NEARER = 0.85  # than a film's camera: the forearm need not be seen
+_WRIST_SCALE, _TIP_SCALE = 0.11, 0.04  # m, of the handles
+
+OnWrist = Callable[[np.ndarray, np.ndarray, str], None]
+"""Told position (3,), orientation (4,) and phase (start, update, end) of the wrist's handle."""
+OnTip = Callable[[int, np.ndarray, str], None]
+"""Told finger, position (3,) and phase of a fingertip's handle."""
+
+
+@dataclass
+class _Part:
+    mesh: viser.MeshHandle
+    rgb: tuple[int, int, int]
+
+
+class Stage:
+    """Draws the scene, shared by all pages.
+
+    Args:
+        server: whose scene it is.
+        scene: what to draw.
+        kinematics: of the scene.
+        looks: what is seen of it.
+        solid: the shapes that contacts are computed with.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        scene: Scene,
+        kinematics: Kinematics,
+        looks: Sequence[Shape],
+        solid: Sequence[Shape],
+    ) -> None:
+        self._scene_api, self._scene, self._kinematics = server.scene, scene, kinematics
+        self._frames: dict[int, viser.FrameHandle] = {}
+        self._parts: dict[int, list[_Part]] = {}
+        self._solid: list[viser.MeshHandle] = []
+        self._inside: frozenset[int] = frozenset()
+        self._lights()
+        for number, shape in enumerate(looks):
+            name = f"{self._frame(shape.body)}/{number}"
+            mesh = self._mesh(name, shape, None)
+            self._parts.setdefault(shape.body, []).append(_Part(mesh, shape.rgb))
+        for shape in solid:
+            mesh = self._mesh(f"{self._frame(shape.body)}/solid", shape, 0.45)
+            mesh.visible = False
+            self._solid.append(mesh)
+        self.wrist = self._scene_api.add_transform_controls(
+            "/handles/wrist", scale=_WRIST_SCALE, line_width=3.0, depth_test=False, opacity=0.85
+        )
+        self.tips = [self._tip(finger.name) for finger in kinematics.fingers]
+
+    def on_drag(self, wrist: OnWrist, tip: OnTip) -> None:
+        """Have drags of the handles told, in their order."""
+
+        async def wrist_moved(event: viser.TransformControlsEvent) -> None:
+            handle = event.target
+            wrist(np.array(handle.position), np.array(handle.wxyz), event.phase)
+
+        self.wrist.on_update(wrist_moved)
+        for finger, handle in enumerate(self.tips):
+
+            async def tip_moved(event: viser.TransformControlsEvent, finger: int = finger) -> None:
+                tip(finger, np.array(event.target.position), event.phase)
+
+            handle.on_update(tip_moved)
+
+    def aim(self, server: viser.ViserServer, qpos: np.ndarray) -> None:
+        """Have new pages look at hand and object, with nothing in between."""
+        model, index = self._scene.model, self._scene.index
+        data = self._kinematics.forward(qpos)
+        hand = data.geom_xpos[index.point_geoms]
+        shown = np.concatenate((hand, data.xipos[[index.object_body]]))
+        camera = camera_for(model, data, index.object_body, shown, _ASPECT)
+        around, up = math.radians(camera.azimuth), math.radians(camera.elevation)
+        forward = np.array(
+            [math.cos(around) * math.cos(up), math.sin(around) * math.cos(up), math.sin(up)]
+        )
+        spot = shown.mean(axis=0)
+        server.initial_camera.look_at = tuple(spot)
+        server.initial_camera.position = tuple(spot - _NEARER * camera.distance * forward)
+        server.initial_camera.fov = math.radians(float(model.vis.global_.fovy))
+        server.initial_camera.near = 0.01
+
+    def pose(self, qpos: np.ndarray) -> None:
+        """Move the bodies to qpos (nq,)."""
+        data = self._kinematics.forward(qpos)
+        for body, frame in self._frames.items():
+            if np.abs(frame.position - data.xpos[body]).max() > _STILL:
+                frame.position = data.xpos[body]
+            if np.abs(frame.wxyz - data.xquat[body]).max() > _STILL:
+                frame.wxyz = data.xquat[body]
+
+    def handles(self, qpos: np.ndarray, dragged: object) -> None:
+        """Move the handles to where qpos (nq,) has what they move, but not the one in a hand.
+
+        Args:
+            qpos: the pose.
+            dragged: ``wrist``, a finger's number, or None.
+        """
+        pos, quat = self._kinematics.wrist_pose(qpos)
+        if dragged != "wrist":
+            _place(self.wrist, pos, quat)
+        data = self._kinematics.data
+        for finger, handle in enumerate(self.tips):
+            if finger != dragged:
+                _place(handle, data.xpos[self._kinematics.fingers[finger].tip_body], None)
+
+    def warn(self, figures: Figures) -> None:
+        """Colour the links that cut into something."""
+        for body in self._inside ^ figures.links:
+            for part in self._parts.get(self._drawn(body), []):
+                part.mesh.color = INSIDE_RGB if body in figures.links else part.rgb
+        self._inside = figures.links
+
+    def show_handles(self, which: str) -> None:
+        """Show handles: ``all``, ``wrist``, ``fingertips`` or ``none``."""
+        self.wrist.visible = which in ("all", "wrist")
+        for handle in self.tips:
+            handle.visible = which in ("all", "fingertips")
+
+    def show_solid(self, shown: bool) -> None:
+        """Show the shapes that contacts are computed with, or not."""
+        for mesh in self._solid:
+            mesh.visible = shown
+
+    def _drawn(self, body: int) -> int:
+        """Return the nearest body towards the palm of which something is seen."""
+        while body not in self._parts and body:
+            body = int(self._scene.model.body_parentid[body])
+        return body
+
+    def _lights(self) -> None:
+        scene = self._scene_api
+        scene.configure_environment_map("studio", environment_intensity=0.25)
+        # The page's shadows are made for rooms: a hand over a table casts none, but they cost.
+        scene.configure_default_lights(cast_shadow=False)
+        scene.world_axes.visible = False
+
+    def _frame(self, body: int) -> str:
+        name = f"/scene/{body}_{self._scene.model.body(body).name.replace('/', '_')}"
+        if body not in self._frames:
+            self._frames[body] = self._scene_api.add_frame(name, show_axes=False)
+        return name
+
+    def _mesh(self, name: str, shape: Shape, opacity: float | None) -> viser.MeshHandle:
+        return self._scene_api.add_mesh_simple(
+            name,
+            shape.vertices,
+            shape.faces,
+            color=shape.rgb,
+            opacity=opacity,
+            side="double",
+            cast_shadow=opacity is None,
+        )
+
+    def _tip(self, name: str) -> viser.TransformControlsHandle:
+        return self._scene_api.add_transform_controls(
+            f"/handles/{name}",
+            scale=_TIP_SCALE,
+            line_width=3.0,
+            disable_rotations=True,
+            disable_sliders=True,
+            depth_test=False,
+        )
+
+
+def _place(handle: viser.TransformControlsHandle, pos: np.ndarray, quat: np.ndarray | None) -> None:
+    if np.abs(handle.position - pos).max() > _STILL:
+        handle.position = pos
+    if quat is not None and np.abs(handle.wxyz - quat).max() > _STILL:
+        handle.wxyz = quat

@@ -1,0 +1,49 @@
+"""From predicted hands to hands that touch nothing."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from pgdm.library.clearance import CLEARANCE_M
+from pgdm.sim.contact import HandContact
+from pgdm.sim.scene import Scene
+
+_SPREAD = 0.01, 0.08  # of the first samples: m of sliding, rad of turning joints
+_SAMPLES, _ELITE, _ROUNDS = 48, 8, 40
+_PATIENCE = 6  # rounds without a better free pose
+_DEPTH_WEIGHT = 1e3  # cost of a metre of summed penetration, against squared spreads
+
+
+def freed(scene: Scene, qpos: np.ndarray, seed: int = 0) -> np.ndarray | None:
+    """Return a state (nq,) near qpos in which the hand touches nothing, or None if none is found.
+
+    A cross-entropy search over the hand's joints, as :mod:`pgdm.library.clearance` makes it.
+    Objects stay where they are; joints keep their limits; equal arguments give an equal result.
+    """
+    model, nu = scene.model, scene.model.nu
+    contact = HandContact(scene)
+    low, high = model.jnt_range[:nu].T
+    scale = np.where(model.jnt_type[:nu] == mujoco.mjtJoint.mjJNT_SLIDE, *_SPREAD)
+    start, trial = qpos[:nu].clip(low, high), qpos.copy()
+    trial[:nu] = start
+    if contact.overlap(trial, CLEARANCE_M) == 0.0:
+        return trial
+    stream = np.random.Generator(np.random.PCG64(seed))
+    mean, spread = np.zeros(nu), np.ones(nu)
+    best, best_cost, waited = None, np.inf, 0
+    for _ in range(_ROUNDS):
+        moves = mean + spread * stream.standard_normal((_SAMPLES, nu))
+        costs = np.empty(_SAMPLES)
+        waited += best is not None
+        for i, move in enumerate(moves):
+            trial[:nu] = (start + scale * move).clip(low, high)
+            overlap = contact.overlap(trial, CLEARANCE_M)
+            costs[i] = _DEPTH_WEIGHT * overlap + float(move @ move) / nu
+            if overlap == 0.0 and costs[i] < best_cost:
+                best, best_cost, waited = trial.copy(), costs[i], 0
+        if waited >= _PATIENCE:
+            break
+        elite = moves[np.argsort(costs)[:_ELITE]]
+        mean, spread = elite.mean(axis=0), elite.std(axis=0) + 0.02
+    return best

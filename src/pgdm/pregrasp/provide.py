@@ -1,0 +1,218 @@
+"""Making the start that a run asks for, where there is none and it can be made by itself.
+
+Two can: ``mocap``, from a human hand's joints, and ``planned`` of a hand that is not the task's
+own: the same pre-grasp with the state in which a reach plan ends there.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from pgdm.errors import LibraryError, UnknownNameError
+from pgdm.library import Library, Motion, ensure_expert, pregrasp_file, rebuild
+from pgdm.library.pregrasp_file import Pregrasp
+from pgdm.library.report import Progress, silent
+from pgdm.pregrasp.mocap import Retargeted, check, of_task, retarget
+from pgdm.pregrasp.reach import plan_reach
+from pgdm.pregrasp.reach_plan import OBJECT_TOLERANCE_M, ReachPlan
+from pgdm.pregrasp.recording import Recording
+from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
+
+Notify = Callable[[str], None]
+
+LOCK_TIMEOUT_S = 3600.0
+"""How long to wait for another process that makes the same start."""
+DEEPER_M = 0.001
+"""A plan that ends deeper in something than this is not taken."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Which start is wanted, and of what."""
+
+    task: TaskCfg
+    hand: HandCfg
+    """The hand that is to take the task up."""
+    own_hand: HandCfg
+    """The task's own hand."""
+    sim: SimCfg
+    source: str
+    """``pregrasp.source``."""
+
+    @property
+    def path(self) -> Path:
+        """Where the user's own start of this kind lies."""
+        return pregrasp_file.path_of(self.task.id, self.hand.name, self.source)
+
+    @property
+    def can_be_made(self) -> bool:
+        """Whether such a start is made by itself."""
+        if self.source == "mocap":
+            return True
+        return self.source == "planned" and self.hand.name != self.own_hand.name
+
+
+def ensure_start(
+    library: Library,
+    wanted: Wanted,
+    offline: bool,
+    notify: Notify | None = None,
+    progress: Progress = silent,
+    num_threads: int = 0,
+) -> None:
+    """Make and store a start that is wanted, if there is none and it can be made.
+
+    Of several processes one makes it and the others wait. The same assets give the same start.
+
+    Args:
+        library: with the task.
+        wanted: which start.
+        offline: never fetch the human hand's joints.
+        notify: told in a sentence what is made, and how well it fits; by default the log is.
+        progress: told how far it is.
+        num_threads: for the reach planner; 0 takes one per core. The result does not depend on it.
+
+    Raises:
+        ConfigError: the hand cannot take up the task.
+        LibraryError: something is missing and cannot be fetched, or the start cannot be stored.
+    """
+    notify = notify or _log.warning
+    if not wanted.can_be_made or wanted.path.is_file():
+        return
+    with _locked(wanted.path, notify):
+        if wanted.path.is_file():  # another process was first
+            return
+        notify(
+            f"no start '{wanted.source}' of {wanted.task.id} with hand {wanted.hand.name} is "
+            "stored yet: making it once by inverse kinematics and a reach plan"
+        )
+        scene = build_scene(library, wanted.task, wanted.hand, wanted.sim)
+        motion = library.motion(wanted.task.motion)
+        recording = human_hand(library, wanted, motion, offline, notify)
+        progress("inverse kinematics", 0, 1)
+        made = retarget(scene, library, motion, recording)
+        check(made, scene)
+        reached = with_plan(made.pregrasp, scene, motion, notify, progress, num_threads)
+        store(wanted.path, reached)
+    notify(f"{wanted.path}: from {recording.origin}; {told(made)}")
+
+
+def human_hand(
+    library: Library, wanted: Wanted, motion: Motion, offline: bool, notify: Notify
+) -> Recording:
+    """Return the human hand to follow, fetched if the library can have it but does not.
+
+    Raises:
+        ConfigError: the task has neither a human hand nor a pre-grasp of its own to follow.
+        LibraryError: it cannot be fetched.
+    """
+    # What is only rebuilt from another package is not fetched for a start: the task's own
+    # pre-grasp is as near.
+    if motion.id not in rebuild.TASKS:
+        with suppress(UnknownNameError):
+            library = ensure_expert(motion.id, offline, notify, library.root)
+    own = build_scene(library, wanted.task, wanted.own_hand, wanted.sim)
+    return of_task(library, own, motion)
+
+
+def with_plan(
+    pregrasp: Pregrasp,
+    scene: Scene,
+    motion: Motion,
+    notify: Notify,
+    progress: Progress = silent,
+    num_threads: int = 0,
+) -> Pregrasp:
+    """Return a pre-grasp with the state in which a reach plan ends there.
+
+    A plan that pushes the object away or ends in something is not taken: then an episode starts at
+    the pose itself, set.
+    """
+
+    def tell(done: int, rounds: int, cost: float) -> None:
+        progress("reach plan", done, rounds)
+
+    plan = plan_reach(
+        scene, pregrasp.pose.qpos, motion.substeps, num_threads=num_threads, progress=tell
+    )
+    usable = plan.object_moved_m < OBJECT_TOLERANCE_M and (
+        plan.depth_m <= max(plan.target_depth_m, DEEPER_M)
+    )
+    figures = _figures(plan) | {"plan_taken": usable}
+    if not usable:
+        notify(
+            f"the reach plan of {scene.task.id} with hand {scene.hand.name} moves the object "
+            f"{1e3 * plan.object_moved_m:.0f} mm and ends {1e3 * plan.depth_m:.1f} mm in "
+            "something: episodes start at the pre-grasp itself, set kinematically"
+        )
+    return replace(
+        pregrasp,
+        reached=plan.state if usable else None,
+        note={**pregrasp.note, "reach": figures},
+    )
+
+
+def store(path: Path, pregrasp: Pregrasp) -> None:
+    """Write a pre-grasp.
+
+    Raises:
+        LibraryError: it cannot be written.
+    """
+    try:
+        pregrasp_file.write(path, pregrasp)
+    except OSError as error:
+        raise LibraryError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def told(made: Retargeted) -> str:
+    """Return how well a pre-grasp fits, for people."""
+    return "; ".join([made.fit, *made.unreachable])
+
+
+def _figures(plan: ReachPlan) -> dict[str, float | bool]:
+    return {
+        "reached": plan.reached,
+        "base_error_mm": round(1e3 * plan.base_error_m, 1),
+        "base_error_rad": round(plan.base_error_rad, 3),
+        "finger_error_rad": round(plan.finger_error_rad, 3),
+        "object_moved_mm": round(1e3 * plan.object_moved_m, 2),
+        "depth_mm": round(1e3 * plan.depth_m, 2),
+    }
+
+
+@contextmanager
+def _locked(path: Path, notify: Notify) -> Iterator[None]:
+    """Hold the lock of one start.
+
+    Raises:
+        LibraryError: the folder cannot be written, or another process holds it too long.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(str(path.with_name(f".{path.stem}.lock")))
+        try:
+            lock.acquire(timeout=0.2)
+        except Timeout:
+            begun = time.monotonic()
+            notify(f"another process is making {path}: waiting for it")
+            lock.acquire(timeout=LOCK_TIMEOUT_S)
+            _log.info("waited %.0f s for %s", time.monotonic() - begun, path)
+    except Timeout as error:
+        raise LibraryError(
+            f"{path}: another process has been making it for {LOCK_TIMEOUT_S:.0f} s; wait or end it"
+        ) from error
+    except OSError as error:
+        raise LibraryError(f"{path}: cannot be written ({error.strerror or error})") from error
+    try:
+        yield
+    finally:
+        lock.release()
