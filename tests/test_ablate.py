@@ -14,6 +14,7 @@ import pgdm
 from command_line import command
 from pgdm.config.groups import available
 from pgdm.config.store import compose
+from pgdm.config.suites import suite
 from pgdm.envs.build import EnvBuilder
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.experiment import env_builder
@@ -170,9 +171,8 @@ def test_mean_fingers_are_those_of_the_mined_pre_grasps() -> None:
         name: mujoco.MjModel.from_xml_path(str(library.hand_xml(name, "checkout")))
         for name in hands
     }
-    for task in available("task"):
-        if task == "dmanus-sim2real":  # it has dmanus-crackerbox's pre-grasp, and is not in tcdm50
-            continue
+    # Of these 50: dmanus-sim2real has dmanus-crackerbox's pre-grasp.
+    for task in suite("tcdm50"):
         prefix = task.split("-")[0]
         hand = hands[prefix if prefix in hands else "adroit"]
         model, first = models[hand.name], hand.num_base_joints + hand.num_wrist_joints

@@ -438,7 +438,7 @@ def test_a_file_in_the_library_s_place_is_an_error_of_one_line(
 @pytest.mark.skipif(not ROOT, reason="needs a TCDM checkout: name one with PGDM_TCDM_ROOT")
 def test_the_real_checkout_has_all_51_tasks(library_home: Path) -> None:
     found = open_library(library_home / "library")
-    assert len(found.tasks()) == 51
+    assert len(found.sources()["checkout"].tasks) == 51
     assert found.hands() == ["adroit", "dhand", "dmanus"]
     content = found.sources()["checkout"]
     assert [d.split(": ", 1)[1] for d in content.defects] == [

@@ -39,8 +39,8 @@ def expanded(*overrides: str) -> list[tuple[str, ...]]:
         (["+experiment=quickstart"], [("+experiment=quickstart",)]),
         (["task=dmanus"], [("task=dmanus-coffeecan",), ("task=dmanus-crackerbox",)]),
         (["task=choice(dmanus)"], [("task=dmanus-coffeecan",), ("task=dmanus-crackerbox",)]),
-        (["task=dhand-cup,dhand-c*"], [("task=dhand-cup",)]),
-        (["task='dhand-c*'"], [("task=dhand-cup",)]),
+        (["task=dhand-cup,dhand-cu*"], [("task=dhand-cup",)]),
+        (["task='dhand-cu*'"], [("task=dhand-cup",)]),
         (["task=dmanus,-dmanus-coffeecan"], [("task=dmanus-crackerbox",)]),
     ],
 )
