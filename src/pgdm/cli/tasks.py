@@ -64,7 +64,7 @@ def print_tasks(tcdm30: bool) -> None:
             row.paper_success,
             sources.get(row.id, "-"),
         )
-    Console(width=120).print(table)
+    Console(width=110).print(table)
     missing = sum(row.id not in sources for row in rows)
     if missing:
         print(f"{missing} of {len(rows)} tasks are not in the asset library: pgdm assets --help")
