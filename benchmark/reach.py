@@ -5,9 +5,9 @@
 
 The first plans the reach to the mined pre-grasp of each task, carries out the plan that is stored
 with the task beside it, and measures every pre-grasp there is. Each task's figures are stored in
-results/reach/ as soon as they are there; what is stored is not done again. The second makes the
-summary, the picture and the tables of docs/pregrasps/ from them. Needs a library with the tasks'
-assets; plans come with a TCDM checkout only.
+results/reach/ as soon as they are there; what is stored is not done again, unless its file is
+removed. The second makes the summary, the picture and the tables of docs/pregrasps/ from them.
+Needs a library with the tasks' assets; plans come with a TCDM checkout only.
 """
 
 from __future__ import annotations
@@ -77,11 +77,11 @@ def update(task: str, seed: int) -> None:
     if (stored := published(motion, scene)) is not None and stored.actions is not None:
         theirs = measure(scene, stored.actions, target, motion.substeps)
         row["released"] = {**figures(theirs), "failures": theirs.failures}
-    if "quality" not in row:
-        starts = {**all_starts(scene, motion), "reach": plan.state.qpos}
-        lift = LiftTest(scene, motion.substeps)
-        found = {n: quality(scene, qpos, motion.substeps, lift) for n, qpos in starts.items()}
-        row["quality"] = {name: dataclasses.asdict(one) for name, one in found.items()}
+    known = row.setdefault("quality", {})
+    starts = {**all_starts(scene, motion), "reach": plan.state.qpos}
+    lift = LiftTest(scene, motion.substeps)
+    for name in sorted(starts.keys() - known.keys()):
+        known[name] = dataclasses.asdict(quality(scene, starts[name], motion.substeps, lift))
     RESULTS.mkdir(parents=True, exist_ok=True)
     with paths.replacing(path) as temp:
         temp.write_text(json.dumps(row, indent=1))

@@ -23,7 +23,7 @@ from pgdm.pregrasp import plans
 from pgdm.pregrasp.cem import CemCfg, CrossEntropy
 from pgdm.pregrasp.reach import REACH, default_steps, measure, plan_reach, play, reset_pose
 from pgdm.pregrasp.reach_plan import Goal, ReachPlan
-from pgdm.pregrasp.rollout import to_actions, to_targets
+from pgdm.pregrasp.rollout import Rollouts, to_actions, to_targets
 from pgdm.pregrasp.waypoints import Waypoints, opposing_finger
 from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene, build_scene
@@ -125,6 +125,23 @@ def test_a_path_has_the_three_stages() -> None:
     off = np.abs(targets - goal.joints) > 0.02
     last = off.cumsum(0).argmax(0)  # last step at which a joint is off
     assert last[25:].max() < last[8:25].max()
+
+
+@pytest.mark.usefixtures("library_home")
+def test_joints_that_a_tendon_couples_share_what_they_cannot_help() -> None:
+    scene, motion = opened("flashlight-lift")
+    goal = Goal(scene, plans.pose_of("mined", motion, scene))
+    rollouts = Rollouts(scene, reset_pose(scene, goal.qpos), 1, motion.substeps, 1)
+    paths = Waypoints(scene, goal.joints, goal.qpos, 40, 8, 0.04)
+    tolerance = goal.tolerance
+    aim, extra = rollouts.settled(paths.above, 0.4 * tolerance, 0.7 * tolerance, 0.6)
+    # The little finger's last joints, 23 and 24, go together: 0.01 and 0.33 rad is impossible.
+    shift = aim - paths.above
+    assert shift[23] == pytest.approx(0.07)
+    assert shift[24] == pytest.approx(-0.07)
+    index = scene.index
+    assert (aim + extra >= index.ctrl_low - 1e-12).all()
+    assert (aim + extra <= index.ctrl_high + 1e-12).all()
 
 
 @pytest.mark.usefixtures("library_home")

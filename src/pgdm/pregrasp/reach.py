@@ -35,7 +35,8 @@ the last number: D'Manus."""
 _END_STD = 0.003, 0.02, 0.03
 """Deviation of the last targets of slides, m, hinges and fingers, rad, in the first round."""
 _END_LIMIT = 5.0  # tolerances that the last targets may be away from the goal
-_SETTLE_STEPS, _SETTLE_GAIN = 25, 0.3  # control steps in the air, in which servos are tried
+_SETTLE_GAIN = 0.6  # share of an error that a step in the air adds to the targets
+_SHIFT = 0.7  # share of the tolerance by which the aim gives way to what servos cannot help
 _SLACK = 0.4  # share of the tolerance within which a remaining error is not corrected
 _SPEED_WEIGHT_S = 0.05  # of the joints' mean final speed, in tolerances a second
 _CHECKED = 4  # candidates of a round that are looked at for penetration
@@ -172,10 +173,15 @@ class _Search:
             scene, self._goal.joints, self._goal.qpos, steps, cfg.hold_steps, dt
         )
         mean, std = self._paths.prior(_END_STD)
-        extra = self._rollouts.settled_error(self._paths.above, _SETTLE_STEPS, _SETTLE_GAIN)
-        limit = _END_LIMIT * self._goal.tolerance
-        first_finger = scene.index.num_base_joints
-        mean[self._paths.layout.ends][first_finger:] = extra.clip(-limit, limit)[first_finger:]
+        tolerance, base = self._goal.tolerance, scene.index.num_base_joints
+        above = self._paths.above
+        nearest, farthest = _SLACK * tolerance, _SHIFT * tolerance
+        aim, extra = self._rollouts.settled(above, nearest, farthest, _SETTLE_GAIN)
+        shift, limit = (aim - above)[base:], _END_LIMIT * tolerance
+        mean[self._paths.layout.ends][base:] = shift + extra.clip(-limit, limit)[base:]
+        # An error that servos cannot help is not corrected again.
+        self._slack = nearest
+        self._slack[base:] = np.where(shift != 0, farthest[base:], nearest[base:])
         self._cem = CrossEntropy(mean, std, cfg.cem, seeding.numpy_stream(seed, "reach"))
         self._best: _Candidate | None = None
         self._rounds = self._idle = 0
@@ -235,7 +241,10 @@ class _Search:
             return
         goal, tolerance = self._goal.joints, self._goal.tolerance
         error = (goal - qpos[:, : len(goal)]).mean(0)
-        error = np.sign(error) * (np.abs(error) - _SLACK * tolerance).clip(0.0)
+        error = np.sign(error) * (np.abs(error) - self._slack).clip(0.0)
         at, limit = self._paths.layout.ends, _END_LIMIT * tolerance
         ends = self._cem.mean[at] + self._cfg.correction * error
+        # Beyond the servos' ranges a correction changes nothing, and would have to be undone.
+        index = self._scene.index
+        ends = ends.clip(index.ctrl_low - goal, index.ctrl_high - goal)
         self._cem.mean[at] = ends.clip(-limit, limit)

@@ -139,22 +139,37 @@ class Rollouts:
             quat.append(state.object_quat[0].numpy())
         return ObjectTrack(np.stack(pos), np.stack(quat))
 
-    def settled_error(self, joints: np.ndarray, steps: int, gain: float) -> np.ndarray:
-        """Return what servos need beyond their goal to bring the hand to joints (nu,), (nu,).
+    def settled(
+        self, joints: np.ndarray, nearest: np.ndarray, farthest: np.ndarray, gain: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return where servos come to rest near joints, and what they need beyond it, (nu,) each.
 
-        Held there for a while, the targets follow what is lacking, as an integrator would.
+        They are held at the joints for a second. What they lack by more than ``nearest`` they
+        cannot help, such as joints that a tendon couples: the aim moves there, by ``farthest`` at
+        most. For another second their targets follow what is still lacking, as an integrator would.
+
+        Args:
+            joints: where the hand shall be, (nu,) m and rad.
+            nearest: error that leaves the aim where it is, (nu,).
+            farthest: largest shift of the aim, (nu,).
+            gain: share of the error that a step adds to the targets.
         """
-        index = self._scene.index
-        sim, nu = SimBatch(self._scene, 1, 1, self._substeps), len(joints)
+        index, nu = self._scene.index, len(joints)
+        sim, steps = SimBatch(self._scene, 1, 1, self._substeps), round(1 / self.control_dt_s)
         sim.reset(np.array([0]), self._start, np.zeros(self._scene.model.nv))
-        extra = np.zeros(nu)
+        aim, extra = joints.copy(), np.zeros(nu)
         for k in range(2 * steps):
-            targets = (joints + extra).clip(index.ctrl_low, index.ctrl_high)
-            if sim.step(targets[None]).any():
-                return np.zeros(nu)
+            if sim.step((aim + extra)[None]).any():
+                return joints.copy(), np.zeros(nu)
+            rest = sim.read().qpos[0, :nu].numpy()
+            if k == steps:
+                off = rest - joints
+                aim += np.where(np.abs(off) > nearest, off.clip(-farthest, farthest), 0.0)
             if k >= steps:
-                extra += gain * (joints - sim.read().qpos[0, :nu].numpy())
-        return extra
+                # What a servo cannot be told would have to be unlearnt later.
+                extra += gain * (aim - rest)
+                extra = extra.clip(index.ctrl_low - aim, index.ctrl_high - aim)
+        return aim, extra
 
     def run(self, actions: np.ndarray, reference: ObjectTrack) -> Ends:
         """Return where plans (N, K, nu) end, the object compared with a reference."""
