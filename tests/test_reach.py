@@ -310,7 +310,7 @@ def test_a_stopped_command_keeps_what_is_done() -> None:
         time.sleep(0.1)
     time.sleep(1)  # until it is in the table as well
     running.send_signal(signal.SIGINT)
-    out, err = running.communicate(timeout=60)
+    out, err = running.communicate(timeout=300)
     assert running.returncode == 130
     assert "the plans in the table are stored" in err
     assert f"{EASY}  stored" in out
