@@ -31,6 +31,7 @@ QUICK = (
     "pgdm tasks",
     "pgdm assets list",
     "pgdm assets show cup-pour1",
+    "pgdm pregrasp show hammer-use1",
     "pgdm-run task=cup-pour1 method=deepmimic --dry-run",
     "pgdm view cup-pour1 --ablations --image starts.png",
     "pgdm-run -m task=tcdm30 seed=0,1,2 --dry-run",
