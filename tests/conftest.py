@@ -46,7 +46,7 @@ def _digest(checkout: Path) -> str:
 
 
 def _filled_home(checkout: Path) -> Path:
-    """Return a ``PGDM_HOME`` with all tasks in its library, made once per the checkout's content."""
+    """Return a ``PGDM_HOME`` with all tasks, made once per content of checkout and program."""
     import pgdm.library  # here: tests that need no library should not wait for the simulator
     from pgdm.library import animated
 
