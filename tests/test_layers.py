@@ -15,7 +15,7 @@ PACKAGE = REPOSITORY / "src" / "pgdm"
 # room on its floor. docs/architecture.md draws this table.
 FLOORS: list[set[str]] = [
     {"errors"},
-    {"rotations", "seeding", "paths", "stop"},
+    {"rotations", "seeding", "cem", "paths", "stop"},
     {"library"},
     {"motion"},
     {"sim"},

@@ -15,12 +15,12 @@ import pytest
 
 import pgdm
 from command_line import command
+from pgdm.cem import CemCfg, CrossEntropy
 from pgdm.config.store import compose
 from pgdm.errors import ConfigError, SceneError
 from pgdm.library import Motion, open_library, pregrasp_file
 from pgdm.make import make_gym
 from pgdm.pregrasp import plans
-from pgdm.pregrasp.cem import CemCfg, CrossEntropy
 from pgdm.pregrasp.reach import REACH, default_steps, measure, plan_reach, play, reset_pose
 from pgdm.pregrasp.reach_plan import Goal, ReachPlan
 from pgdm.pregrasp.rollout import Rollouts, to_actions, to_targets
@@ -55,9 +55,9 @@ def store(task: str) -> ReachPlan:
 
 def test_the_search_finds_the_least_of_a_bowl() -> None:
     goal = np.array([1.0, -2.0, 0.5])
-    search = CrossEntropy(np.zeros(3), np.ones(3), CemCfg(40, 6, 0.2), np.random.default_rng(0))
+    search = CrossEntropy(np.zeros(3), np.ones(3), CemCfg(40, 6, 0.2, least=0.1), np.random.default_rng(0))
     for _ in range(30):
-        samples = search.ask(None)
+        samples = search.ask()
         search.tell(samples, ((samples - goal) ** 2).sum(1))
     np.testing.assert_allclose(search.mean, goal, atol=0.15)
 
@@ -65,14 +65,19 @@ def test_the_search_finds_the_least_of_a_bowl() -> None:
 def test_a_round_of_the_search_by_hand() -> None:
     cfg = CemCfg(population=4, elites=2, smoothing=0.5)
     search = CrossEntropy(np.zeros(1), np.ones(1), cfg, np.random.default_rng(0))
-    asked = search.ask(np.array([7.0]))
-    assert asked[0] == 0.0  # the mean itself
-    assert asked[1] == 7.0  # the best so far
+    asked = search.ask()
+    np.testing.assert_array_equal(asked[:, 0], np.random.default_rng(0).standard_normal(4))
     samples = np.array([[4.0], [2.0], [9.0], [0.0]])
     elites = search.tell(samples, np.array([1.0, 0.5, np.inf, 3.0]))
     assert elites.tolist() == [1, 0]
     assert search.mean[0] == pytest.approx(0.5 * 0.0 + 0.5 * 3.0)
     assert search.std[0] == pytest.approx(0.5 * 1.0 + 0.5 * 1.0)  # of 2 and 4
+    wide = CrossEntropy(np.zeros(1), np.ones(1), replace(cfg, added=0.1), np.random.default_rng(0))
+    wide.tell(samples, np.array([1.0, 0.5, np.inf, 3.0]))
+    assert wide.std[0] == pytest.approx(1.1)
+    frozen = CrossEntropy(np.zeros(1), np.full(1, 2.0), CemCfg(4, 1, least=0.3), None)
+    frozen.tell(samples, np.arange(4.0))
+    assert frozen.std[0] == pytest.approx(0.6)
     # Where everything diverged nothing is learnt.
     assert not len(search.tell(samples, np.full(4, np.inf)))
     assert search.mean[0] == pytest.approx(1.5)

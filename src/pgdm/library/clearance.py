@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from pgdm.cem import CemCfg, CrossEntropy
 from pgdm.errors import CorruptAssetError
 
 CLEARANCE_M = 0.0005
@@ -14,7 +15,7 @@ CLEARANCE_M = 0.0005
 
 _SPREAD = (0.01, 0.05)
 """First spread of the search: m of the sliding joints, rad of the turning ones."""
-_SAMPLES, _ELITE, _ROUNDS = 64, 8, 40
+_CEM, _ROUNDS = CemCfg(64, 8, added=0.02), 40
 _DEPTH_WEIGHT = 1e3
 """Cost of a metre of penetration, against squared spreads of movement."""
 _OBJECT_HEIGHT_M = 0.2
@@ -43,19 +44,18 @@ def moved_out(table: Path, hand: Path, thing: Path, qpos: np.ndarray) -> np.ndar
     start = qpos[:joints].clip(low, high)
     data.qpos[:] = qpos
     stream = np.random.Generator(np.random.PCG64(0))
-    mean, spread = np.zeros(joints), np.ones(joints)
+    search = CrossEntropy(np.zeros(joints), np.ones(joints), _CEM, stream)
     best, best_cost = start, np.inf
     for _ in range(_ROUNDS):
-        moves = mean + spread * stream.standard_normal((_SAMPLES, joints))
-        costs = np.empty(_SAMPLES)
+        moves = search.ask()
+        costs = np.empty(len(moves))
         for i, move in enumerate(moves):
             data.qpos[:joints] = (start + scale * move).clip(low, high)
             depth = _penetration(model, data)
             costs[i] = _DEPTH_WEIGHT * depth + float(move @ move) / joints
             if depth == 0.0 and costs[i] < best_cost:
                 best, best_cost = data.qpos[:joints].copy(), costs[i]
-        elite = moves[np.argsort(costs)[:_ELITE]]
-        mean, spread = elite.mean(axis=0), elite.std(axis=0) + 0.02
+        search.tell(moves, costs)
     if not np.isfinite(best_cost):
         raise CorruptAssetError(f"{thing.parent.name}: the hand cannot be moved out of the object")
     return np.concatenate((best, qpos[joints:]))

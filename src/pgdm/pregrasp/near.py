@@ -15,19 +15,19 @@ import mujoco
 import numpy as np
 
 from pgdm import seeding
+from pgdm.cem import CemCfg, CrossEntropy
 from pgdm.errors import SceneError
-from pgdm.sim.contact import HandContact
+from pgdm.sim.contact import FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
 CLEARANCE_M = 0.003
 """Distance that the search keeps; what is found touches nothing at all."""
 TIP_DISTANCE_M = 0.015
 """Wanted distance of the fingertips from the object."""
-FAR_M = 0.3  # beyond which a distance is no longer measured
 
-STARTS, ROUNDS, SAMPLES, ELITE = 8, 30, 48, 8
+STARTS, ROUNDS = 8, 30
 _SPREAD = (0.04, 0.3, 0.2)  # first spread: slides m, hinges rad, fingers rad
-_FLOOR = 0.03  # of the first spread that is left at the end
+_CEM = CemCfg(48, 8, added=0.03)
 _WRIST_RAD = (0.7, 0.7, 1.3)  # directions of the wrist that are begun at, rad about each axis
 _WEIGHTS = {
     "depth": 20.0,  # a metre of penetration, against metres of distance
@@ -114,11 +114,7 @@ class _Search:
         self._scale = np.full(nu, _SPREAD[2])
         self._scale[:3], self._scale[3:base] = _SPREAD[0], _SPREAD[1]
         self._tips = scene.index.point_geoms[scene.index.fingertips]
-        self._links = [self._link(tip) for tip in self._tips]
-        body = scene.index.object_body
-        self._object = np.flatnonzero(
-            (model.geom_bodyid == body) & ((model.geom_contype | model.geom_conaffinity) != 0)
-        )
+        self._distance = FingertipDistance(scene)
 
     def run(self, stream: np.random.Generator, first: bool) -> NearPose | None:
         """Search from one direction of the wrist, the hand's own one first."""
@@ -126,16 +122,15 @@ class _Search:
         limits = np.array(_WRIST_RAD[: self._base - 3])
         start[3 : self._base] = 0.0 if first else stream.uniform(-limits, limits)
         start = self._centred(start.clip(self._low, self._high))
-        mean, spread = np.zeros(self._nu), np.ones(self._nu)
+        search = CrossEntropy(np.zeros(self._nu), np.ones(self._nu), _CEM, stream)
         best, best_cost = None, np.inf
         for _ in range(ROUNDS):
-            moves = mean + spread * stream.standard_normal((SAMPLES, self._nu))
+            moves = search.ask()
             joints = (start + self._scale * moves).clip(self._low, self._high)
             costs = np.array([self._cost(row)[0] for row in joints])
-            order = np.argsort(costs)[:ELITE]
-            if costs[order[0]] < best_cost:
-                best, best_cost = joints[order[0]].copy(), float(costs[order[0]])
-            mean, spread = moves[order].mean(axis=0), moves[order].std(axis=0) + _FLOOR
+            first_of_round = search.tell(moves, costs)[0]
+            if costs[first_of_round] < best_cost:
+                best, best_cost = joints[first_of_round].copy(), float(costs[first_of_round])
         if best is None:
             return None
         cost, distances = self._cost(best)
@@ -150,7 +145,7 @@ class _Search:
         self._place(joints)
         mujoco.mj_collision(model, data)
         depth = self._contact.too_near(data, CLEARANCE_M)
-        distances = np.array([self._distance(link) for link in self._links])
+        distances = self._distance(data)
         com = data.xipos[self._scene.index.object_body]
         tips = data.geom_xpos[self._tips]
         ways = tips - com
@@ -189,22 +184,3 @@ class _Search:
         moved = joints.copy()
         moved[:3] += mount.reshape(3, 3).T @ way
         return moved.clip(self._low, self._high)
-
-    def _link(self, tip: int) -> np.ndarray:
-        """Return the contact geoms of the link that carries a fingertip's point."""
-        model = self._model
-        body = model.geom_bodyid[tip]
-        while True:
-            touching = (model.geom_contype | model.geom_conaffinity) != 0
-            geoms = np.flatnonzero((model.geom_bodyid == body) & touching)
-            if len(geoms) or body == 0:
-                return geoms if body else np.array([tip])
-            body = model.body_parentid[body]
-
-    def _distance(self, link: np.ndarray) -> float:
-        ends = np.zeros(6)
-        return min(
-            mujoco.mj_geomDistance(self._model, self._data, a, b, FAR_M, ends)
-            for a in link.tolist()
-            for b in self._object.tolist()
-        )

@@ -6,12 +6,13 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from pgdm.cem import CemCfg, CrossEntropy
 from pgdm.pregrasp.targets import HandShape, Targets
 from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
 
 _SPREAD = 0.01, 0.08  # of the first samples: m of sliding, rad of turning joints
-_SAMPLES, _ELITE, _ROUNDS = 64, 8, 40
+_CEM, _ROUNDS = CemCfg(64, 8, added=0.02), 40
 _DEPTH_COST = 60.0  # m of fingertip error that a metre of summed penetration counts as
 _MOVE_COST = 1e-3  # m of fingertip error for moving all joints by their spread
 _FAR_M = 0.01  # from here on a fingertip's error counts more than in proportion
@@ -59,17 +60,16 @@ def pushed_out(
         error = float((weights * away * (1.0 + away / _FAR_M)).sum() / len(tips))
         return depth, error + _DEPTH_COST * depth + _MOVE_COST * float(move @ move) / nu
 
-    mean, spread = np.zeros(nu), np.ones(nu)
+    search = CrossEntropy(np.zeros(nu), np.ones(nu), _CEM, stream)
     best, best_rank = start, (np.inf, np.inf)
     for _ in range(_ROUNDS):
-        moves = mean + spread * stream.standard_normal((_SAMPLES, nu))
-        costs = np.empty(_SAMPLES)
+        moves = search.ask()
+        costs = np.empty(len(moves))
         for i, move in enumerate(moves):
             hand = (start + scale * move).clip(low, high)
             depth, costs[i] = cost(hand, move)
             rank = (max(depth, _EXACT_M), costs[i])
             if rank < best_rank:
                 best, best_rank = hand, rank
-        elite = moves[np.argsort(costs)[:_ELITE]]
-        mean, spread = elite.mean(axis=0), elite.std(axis=0) + 0.02
+        search.tell(moves, costs)
     return np.concatenate((best, qpos[nu:]))

@@ -13,14 +13,11 @@ from pgdm.errors import ConfigError
 from pgdm.library import Start
 from pgdm.pregrasp.flexion import Flexion
 from pgdm.sim.batch import SimBatch
-from pgdm.sim.contact import HandContact
+from pgdm.sim.contact import FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
 FREE_M = 1e-4
 """A hand that is less deep in something touches nothing: below what a solver can tell."""
-FAR_M = 0.5
-"""Fingertips farther than this from the object count as this far."""
-
 LIFT_M = 0.02
 """How far the object's centre of mass must rise: as much as earns the reward's bonus (SPEC 1)."""
 CARRY_M = 0.1
@@ -43,7 +40,8 @@ class Quality:
     depth_m: float
     """Deepest penetration of the hand and anything else."""
     fingertip_distance_m: float
-    """From the collision surface of the fingers' last links to the object's, mean over fingers."""
+    """From the collision surface of the fingers' last links to the object's, mean over fingers; a
+    link that cuts into it counts as 0."""
     palm_angle_rad: float
     """Between where the palm looks and the way from its middle to the object's centre of mass."""
     lift_rate: float
@@ -148,34 +146,10 @@ def quality(scene: Scene, qpos: np.ndarray, substeps: int, lift: LiftTest | None
     return Quality(
         free=depth <= FREE_M,
         depth_m=depth,
-        fingertip_distance_m=float(fingertip_distances(scene, data).mean()),
+        fingertip_distance_m=float(FingertipDistance(scene)(data).clip(0.0).mean()),
         palm_angle_rad=math.acos(min(1.0, max(-1.0, cosine))),
         lift_rate=rate,
     )
-
-
-def fingertip_distances(scene: Scene, data: mujoco.MjData) -> np.ndarray:
-    """Return how far each finger's last link is from the object, (F,) m; 0 where they touch.
-
-    Args:
-        scene: of the task.
-        data: its state, with current kinematics.
-    """
-    model, index = scene.model, scene.index
-    solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    of_object = model.body_weldid[model.geom_bodyid] == model.body_weldid[index.object_body]
-    objects = np.flatnonzero(solid & of_object).tolist()
-    found = []
-    for body in index.point_bodies[index.fingertips]:
-        tips = np.flatnonzero(solid & (model.geom_bodyid == body)).tolist()
-        tips = tips or [int(index.point_geoms[index.point_bodies == body][0])]
-        pairs = (
-            mujoco.mj_geomDistance(model, data, tip, one, FAR_M, None)
-            for tip in tips
-            for one in objects
-        )
-        found.append(max(0.0, min(pairs, default=FAR_M)))
-    return np.array(found)
 
 
 def _can_rise(scene: Scene) -> bool:

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pgdm import seeding
+from pgdm.cem import CemCfg, CrossEntropy
 from pgdm.errors import ConfigError, SceneError
-from pgdm.pregrasp.cem import CemCfg, CrossEntropy
 from pgdm.pregrasp.reach_plan import (
     DEPTH_TOLERANCE_M,
     OBJECT_TOLERANCE_M,
@@ -81,7 +81,7 @@ class ReachCfg:
             )
 
 
-REACH = ReachCfg(None, 8, CemCfg(48, 8, 0.3), 40, 0.5, 0.6, 2)
+REACH = ReachCfg(None, 8, CemCfg(48, 8, 0.3, least=0.1), 40, 0.5, 0.6, 2)
 """The search as it is done for every task."""
 
 
@@ -203,7 +203,10 @@ class _Search:
     def round(self) -> bool:
         """Try one population; return whether the search is over."""
         before, cfg = self._best, self._cfg
-        vectors = self._cem.ask(None if before is None else before.vector)
+        vectors = self._cem.ask()
+        vectors[0] = self._cem.mean
+        if before is not None:
+            vectors[1] = before.vector
         actions = to_actions(self._scene.index, self._paths.targets(vectors))
         ends = self._rollouts.run(actions, self._alone)
         shares = self._goal.shares(ends)

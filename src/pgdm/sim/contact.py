@@ -1,4 +1,4 @@
-"""How deep a hand is in other things."""
+"""How deep a hand is in other things, and how far its fingertips are from the object."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import mujoco
 import numpy as np
 
 from pgdm.sim.scene import Scene
+
+FAR_M = 0.5
+"""Fingertips farther than this from the object count as this far."""
 
 
 class HandContact:
@@ -48,7 +51,7 @@ class HandContact:
     def depths(self, qpos: np.ndarray) -> np.ndarray:
         """Return the deepest penetration of each finger, then of all else of the hand, (F+1,) m."""
         depths = np.zeros(self.num_fingers + 1)
-        for finger, dist in zip(*self._near(qpos, 0.0), strict=True):
+        for finger, dist in zip(*self._near(self._at(qpos), 0.0), strict=True):
             depths[finger] = max(depths[finger], -dist)
         return depths
 
@@ -57,29 +60,59 @@ class HandContact:
 
         0 means that nothing is; more clearance than the geoms' margins is not seen.
         """
-        dist = self._near(qpos, clearance_m)[1]
+        return self.too_near(self._at(qpos), clearance_m)
+
+    def too_near(self, data: mujoco.MjData, clearance_m: float) -> float:
+        """Return the same of a state whose contacts are current, perhaps with wider margins."""
+        dist = self._near(data, clearance_m)[1]
         return float((clearance_m - dist).sum())
 
-    def _near(self, qpos: np.ndarray, clearance_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return finger (-1: other parts) and distance of the contacts that are too close."""
+    def _at(self, qpos: np.ndarray) -> mujoco.MjData:
+        """Return a state at qpos (nq,) with its contacts."""
         model, data = self._model, self._data
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
+        return data
+
+    def _near(self, data: mujoco.MjData, clearance_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return finger (-1: other parts) and distance of the contacts that are too close."""
         pairs, dist = data.contact.geom, data.contact.dist
         of_hand = self._of_hand[pairs]  # (contacts, 2)
         near = (of_hand[:, 0] != of_hand[:, 1]) & (dist < clearance_m)
         geoms = np.where(of_hand[near, 0], pairs[near, 0], pairs[near, 1])
         return self._finger_of_geom[geoms], dist[near]
 
-    def too_near(self, data: mujoco.MjData, clearance_m: float) -> float:
-        """Return by how much the hand's contacts with other things are too close in all, m.
 
-        Args:
-            data: a state whose contacts are current; of this scene, perhaps with wider margins.
-            clearance_m: distance that is wanted.
-        """
-        near = data.contact.dist < clearance_m
-        one, two = self._of_hand[data.contact.geom[near]].T
-        return float((clearance_m - data.contact.dist[near])[one != two].sum())
+class FingertipDistance:
+    """Tells how far the surface of each finger's last link is from the object's.
+
+    Args:
+        scene: of the task.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        model, index = scene.model, scene.index
+        self._model = model
+        solid = (model.geom_contype | model.geom_conaffinity) != 0
+        of_object = model.body_weldid[model.geom_bodyid] == model.body_weldid[index.object_body]
+        self._object = np.flatnonzero(solid & of_object).tolist()
+        self._links = []
+        for body in index.point_bodies[index.fingertips].tolist():
+            # A fingertip's point may be on a body of its own, at the end of the last link.
+            while not (solid & (model.geom_bodyid == body)).any():
+                body = model.body_parentid[body]
+            self._links.append(np.flatnonzero(solid & (model.geom_bodyid == body)).tolist())
+
+    def __call__(self, data: mujoco.MjData) -> np.ndarray:
+        """Return the distances (F,) m of a state with current kinematics; below 0 inside."""
+        return np.array([self._least(data, link) for link in self._links])
+
+    def _least(self, data: mujoco.MjData, link: list[int]) -> float:
+        least = FAR_M
+        for mine in link:
+            for other in self._object:
+                found = mujoco.mj_geomDistance(self._model, data, mine, other, least, None)
+                least = min(least, found)
+        return least

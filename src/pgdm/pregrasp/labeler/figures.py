@@ -10,10 +10,9 @@ import numpy as np
 from pgdm.pregrasp.labeler import names
 from pgdm.pregrasp.labeler.kinematics import Kinematics
 from pgdm.pregrasp.quality import FREE_M
+from pgdm.sim.contact import FingertipDistance
 from pgdm.sim.scene import Scene
 
-FAR_M = 0.3
-"""Distances are not measured beyond this."""
 BEYOND = 0.01
 """By how much, m or rad, a joint may leave its actuator's range: some ranges are rounded."""
 
@@ -38,7 +37,7 @@ class Figures:
     links: frozenset[int]
     """Bodies of the hand that cut into something."""
     tip_distances_m: np.ndarray
-    """From each fingertip's surface to the object's (F,), at most ``FAR_M``; below 0 inside."""
+    """From each fingertip's surface to the object's (F,); below 0 inside."""
     beyond: tuple[str, ...]
     """Joints whose position no actuator target asks for."""
 
@@ -74,12 +73,7 @@ class FigureMaker:
         roots = model.body_rootid[model.jnt_bodyid[: model.nu]]
         self._of_hand = np.isin(model.body_rootid, roots)[model.geom_bodyid]
         self._part = _parts(model, kinematics.fingers)
-        solid = (model.geom_contype | model.geom_conaffinity) != 0
-        weld = model.body_weldid[model.geom_bodyid]
-        of_object = weld == model.body_weldid[scene.index.object_body]
-        self._object = np.flatnonzero(solid & of_object).tolist()
-        links = [one.link for one in kinematics.fingers]
-        self._tips = [np.flatnonzero(solid & (weld == link)).tolist() for link in links]
+        self._distance = FingertipDistance(scene)
 
     def measure(self, qpos: np.ndarray) -> Figures:
         """Return the figures of qpos (nq,)."""
@@ -100,18 +94,8 @@ class FigureMaker:
             deepest[key] = max(deepest.get(key, 0.0), -float(dist))
         touches = [Touch(part, body, depth) for (part, body), depth in deepest.items()]
         touches.sort(key=lambda touch: -touch.depth_m)
-        distances = np.array([self._distance(data, tips) for tips in self._tips])
+        distances = self._distance(data)
         return Figures(tuple(touches), frozenset(links), distances, self._beyond(qpos))
-
-    def _distance(self, data: mujoco.MjData, tips: list[int]) -> float:
-        """Return the least distance of some geoms to the object, m."""
-        least = FAR_M
-        for tip in tips:
-            for geom in self._object:
-                least = min(
-                    least, mujoco.mj_geomDistance(self._model, data, tip, geom, least, None)
-                )
-        return least
 
     def _beyond(self, qpos: np.ndarray) -> tuple[str, ...]:
         low, high = self._index.ctrl_low, self._index.ctrl_high

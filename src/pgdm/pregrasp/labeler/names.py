@@ -78,8 +78,6 @@ class Finger:
     """Such as ``index``."""
     tip_body: int
     """Body whose origin is the fingertip's observed point."""
-    link: int
-    """Last body that a joint moves: what touches with the fingertip."""
     joints: tuple[int, ...]
     """In qpos, from the palm outwards."""
 
@@ -92,15 +90,13 @@ def fingers(scene: Scene) -> list[Finger]:
     for point in index.fingertips.tolist():
         body = tip = int(index.point_bodies[point])
         joints: list[int] = []
-        link = -1
         while body:
             own = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
             of_finger = [j for j in own if first <= j < model.nu]
-            link = body if of_finger and link < 0 else link
             joints[:0] = of_finger
             body = int(model.body_parentid[body])
         name = _finger_name(model, hand.points[point], joints)
-        found.append(Finger(name, tip, max(link, 0), tuple(joints)))
+        found.append(Finger(name, tip, tuple(joints)))
     return found
 
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
-from pgdm.pregrasp.labeler.figures import FAR_M, Figures
+from pgdm.pregrasp.labeler.figures import Figures
 from pgdm.pregrasp.labeler.names import WRIST, Joint
 from pgdm.pregrasp.labeler.state import LabelState
+from pgdm.sim.contact import FAR_M
 
 PAUSE_S = 1.0
 """A slider that rests for so long begins a new step of the history."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from pgdm.cem import CemCfg, CrossEntropy
 from pgdm.library.clearance import CLEARANCE_M
 from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
 
 _SPREAD = 0.01, 0.08  # of the first samples: m of sliding, rad of turning joints
-_SAMPLES, _ELITE, _ROUNDS = 48, 8, 40
+_CEM, _ROUNDS = CemCfg(48, 8, added=0.02), 40
 _PATIENCE = 6  # rounds without a better free pose
 _DEPTH_WEIGHT = 1e3  # cost of a metre of summed penetration, against squared spreads
 
@@ -30,11 +31,11 @@ def freed(scene: Scene, qpos: np.ndarray, seed: int = 0) -> np.ndarray | None:
     if contact.overlap(trial, CLEARANCE_M) == 0.0:
         return trial
     stream = np.random.Generator(np.random.PCG64(seed))
-    mean, spread = np.zeros(nu), np.ones(nu)
+    search = CrossEntropy(np.zeros(nu), np.ones(nu), _CEM, stream)
     best, best_cost, waited = None, np.inf, 0
     for _ in range(_ROUNDS):
-        moves = mean + spread * stream.standard_normal((_SAMPLES, nu))
-        costs = np.empty(_SAMPLES)
+        moves = search.ask()
+        costs = np.empty(len(moves))
         waited += best is not None
         for i, move in enumerate(moves):
             trial[:nu] = (start + scale * move).clip(low, high)
@@ -44,6 +45,5 @@ def freed(scene: Scene, qpos: np.ndarray, seed: int = 0) -> np.ndarray | None:
                 best, best_cost, waited = trial.copy(), costs[i], 0
         if waited >= _PATIENCE:
             break
-        elite = moves[np.argsort(costs)[:_ELITE]]
-        mean, spread = elite.mean(axis=0), elite.std(axis=0) + 0.02
+        search.tell(moves, costs)
     return best

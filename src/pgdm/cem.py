@@ -6,9 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_LEAST_STD = 0.1
-"""Share of the first deviation that always stays, so that the search does not freeze."""
-
 
 @dataclass(frozen=True)
 class CemCfg:
@@ -18,8 +15,12 @@ class CemCfg:
     """Samples of a round."""
     elites: int
     """Of them, how many the next ones are drawn around."""
-    smoothing: float
+    smoothing: float = 0.0
     """Share of the old mean and deviation that a round keeps (0..1)."""
+    least: float = 0.0
+    """Share of the first deviation below which none falls, so that the search does not freeze."""
+    added: float = 0.0
+    """Share of the first deviation that is added to the elites', for the same reason."""
 
 
 class CrossEntropy:
@@ -36,17 +37,13 @@ class CrossEntropy:
         self, mean: np.ndarray, std: np.ndarray, cfg: CemCfg, random: np.random.Generator
     ) -> None:
         self.mean, self.std = mean.copy(), std.copy()
-        self._least = _LEAST_STD * std
+        self._least, self._added = cfg.least * std, cfg.added * std
         self._cfg, self._random = cfg, random
 
-    def ask(self, best: np.ndarray | None) -> np.ndarray:
-        """Return samples (population, D): the mean itself, the best so far, and others."""
+    def ask(self) -> np.ndarray:
+        """Return samples (population, D)."""
         noise = self._random.standard_normal((self._cfg.population, len(self.mean)))
-        noise[0] = 0.0
-        samples = self.mean + self.std * noise
-        if best is not None:
-            samples[1] = best
-        return samples
+        return self.mean + self.std * noise
 
     def tell(self, samples: np.ndarray, cost: np.ndarray) -> np.ndarray:
         """Learn what samples (N, D) cost (N,); return the rows of the elites, best first.
@@ -60,5 +57,5 @@ class CrossEntropy:
         keep = self._cfg.smoothing
         self.mean = keep * self.mean + (1 - keep) * samples[elites].mean(0)
         self.std = keep * self.std + (1 - keep) * samples[elites].std(0)
-        self.std = np.maximum(self.std, self._least)
+        self.std = np.maximum(self.std, self._least) + self._added
         return elites
