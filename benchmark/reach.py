@@ -7,7 +7,8 @@ The first plans the reach to the mined pre-grasp of each task, carries out the p
 with the task beside it, and measures every pre-grasp there is. Each task's figures are stored in
 results/reach/ as soon as they are there; what is stored is not done again, unless its file is
 removed. The second makes the summary, the picture and the tables of docs/pregrasps/ from them.
-Needs a library with the tasks' assets; plans come with a TCDM checkout only.
+Needs a library with the tasks' assets and experts; plans come with a TCDM checkout only. Predicted
+hands are those of benchmark/predictor.py, demonstrations those that PGDM_DAPG_DEMOS names.
 """
 
 from __future__ import annotations
@@ -28,8 +29,10 @@ import numpy as np
 from pgdm import paths
 from pgdm.config.store import compose
 from pgdm.config.suites import suite
-from pgdm.library import Motion, open_library
+from pgdm.library import Library, Motion, open_library
+from pgdm.pregrasp import demonstrations, teleop
 from pgdm.pregrasp.ablate import ablate
+from pgdm.pregrasp.mocap import object_joints, of_expert, retarget
 from pgdm.pregrasp.plans import figures, pose_of, published
 from pgdm.pregrasp.quality import LiftTest, quality
 from pgdm.pregrasp.reach import REACH, measure, plan_reach
@@ -38,6 +41,7 @@ from pgdm.sim.scene import Scene, build_scene
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "reach"
+PREDICTED = HERE / "results" / "predictor"
 DOCS = HERE.parent / "docs"
 Row = dict[str, Any]
 
@@ -78,7 +82,7 @@ def update(task: str, seed: int) -> None:
         theirs = measure(scene, stored.actions, target, motion.substeps)
         row["released"] = {**figures(theirs), "failures": theirs.failures}
     known = row.setdefault("quality", {})
-    starts = {**all_starts(scene, motion), "reach": plan.state.qpos}
+    starts = {**all_starts(scene, library, motion), "reach": plan.state.qpos}
     lift = LiftTest(scene, motion.substeps)
     for name in sorted(starts.keys() - known.keys()):
         known[name] = dataclasses.asdict(quality(scene, starts[name], motion.substeps, lift))
@@ -91,9 +95,21 @@ def update(task: str, seed: int) -> None:
     )
 
 
-def all_starts(scene: Scene, motion: Motion) -> dict[str, np.ndarray]:
-    """Return the task's stored starts, and the mined one with its fingers open or at the mean."""
+def all_starts(scene: Scene, library: Library, motion: Motion) -> dict[str, np.ndarray]:
+    """Return the task's starts of every source, and the mined one with other fingers."""
     starts = {name: start.qpos for name, start in motion.starts.items()}
+    if motion.id in library.experts().experts:  # a person's hand was recorded
+        human = of_expert(library.expert(motion.id), motion)
+        starts["mocap"] = retarget(scene, library, motion, human).result.qpos
+    predicted = PREDICTED / f"{scene.task.id}.json"
+    if predicted.is_file():
+        starts["predicted"] = np.array(json.loads(predicted.read_text())["learned_chosen_qpos"])
+    demonstrations_file = os.environ.get("PGDM_DAPG_DEMOS")
+    if scene.task.id in teleop.LAYOUTS and demonstrations_file:
+        replays = [teleop.replay(scene, d) for d in demonstrations.read(Path(demonstrations_file))]
+        objects = object_joints(motion, scene)
+        cut = teleop.cut(scene, teleop.nearest(replays), objects, "demonstrations")
+        starts["teleop"] = cut.pose.qpos
     mined: StartState = start_state(compose(["pregrasp=mined"]).pregrasp, motion, scene)
     for name in ("open_hand", "mean_hand"):
         cfg = compose([f"ablation={name}"]).ablation
@@ -120,6 +136,9 @@ SOURCES = {
     "mined": "`mined`: as found",
     "planned": "`planned`: after the released plan",
     "reach": "after our plan",
+    "mocap": "`mocap`: ours, from the recorded human hand",
+    "teleop": "`teleop`: ours, from demonstrations",
+    "predicted": "`learned`: ours, the object held out, best of 4",
     "learned": "`learned`: as released",
     "open_hand": "`mined`, `ablation=open_hand`",
     "mean_hand": "`mined`, `ablation=mean_hand`",

@@ -109,6 +109,7 @@ def test_only_what_can_be_made_is_made() -> None:
     assert wanted("mouse-lift", "dhand", "planned").can_be_made
     assert wanted("mouse-lift", "adroit", "mocap").can_be_made
     assert not wanted("mouse-lift", "dhand", "labeled").can_be_made
+    assert not wanted("mouse-lift", "adroit", "learned").can_be_made  # nothing is trained
     said: list[str] = []
     provide.ensure_start(
         open_library(), wanted("mouse-lift", "dhand", "none"), True, notify=said.append

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -279,3 +280,12 @@ def test_from_training_to_a_stored_pregrasp(library_home: Path, tmp_path: Path) 
     other = pregrasp_file.find("dmanus-crackerbox", "dmanus", "learned")
     assert other is not None
     np.testing.assert_array_equal(stored.pose.qpos, other.pose.qpos)
+    # A run makes its start itself, now that a predictor is there.
+    path = pregrasp_file.path_of("dmanus-coffeecan", "dmanus", "learned")
+    run = ("task=dmanus-coffeecan", "pregrasp=learned", "total_frames=2048", "eval.video=false")
+    ended = command("pgdm-run", *run, f"run_dir={tmp_path / 'run'}")
+    assert ended.code == 0, ended.err
+    assert "making it once by a prediction and a reach plan" in ended.err
+    assert pregrasp_file.read(path).note["held_out"] is False
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["pregrasp_used"] == "learned"

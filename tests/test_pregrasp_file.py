@@ -78,6 +78,10 @@ def test_a_run_starts_at_the_users_own(library_home: Path) -> None:
     assert builder.facts()["pregrasp_used"] == "labeled"
     assert builder.facts()["pregrasp_sha256"] == pregrasp_file.read(path).sha256
     assert pregrasp_file.own("cup-pour1", "adroit") == ["labeled"]
+    moved[8] += 3.0
+    pregrasp_file.write(path, Pregrasp(Start(moved, stored.qvel, None), None, {}))
+    with pytest.raises(ConfigError, match=r"labeled.npz: joint adroit/FFJ3 is at 3.*its limits"):
+        env_builder(cfg, open_library())
 
 
 def test_the_users_own_settings_are_found_without_a_flag() -> None:

@@ -55,7 +55,9 @@ def store(task: str) -> ReachPlan:
 
 def test_the_search_finds_the_least_of_a_bowl() -> None:
     goal = np.array([1.0, -2.0, 0.5])
-    search = CrossEntropy(np.zeros(3), np.ones(3), CemCfg(40, 6, 0.2, least=0.1), np.random.default_rng(0))
+    search = CrossEntropy(
+        np.zeros(3), np.ones(3), CemCfg(40, 6, 0.2, least=0.1), np.random.default_rng(0)
+    )
     for _ in range(30):
         samples = search.ask()
         search.tell(samples, ((samples - goal) ** 2).sum(1))

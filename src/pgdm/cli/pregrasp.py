@@ -204,5 +204,7 @@ def predict(
 ) -> None:
     """Predict a pre-grasp from the object's shape: sample, free, rank (pregrasp=learned)."""
     from pgdm.cli.pregrasp_predict import Request, predict_pregrasp
+    from pgdm.pregrasp.predict.predicted import PredictCfg
 
-    predict_pregrasp(Request(task, hand, samples, seed, weights, reach, image, offline))
+    how = PredictCfg(samples, seed, reach)
+    predict_pregrasp(Request(task, hand, how, weights, image, offline))

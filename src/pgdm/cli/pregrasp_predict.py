@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -15,20 +14,15 @@ from pgdm.cli.train import notify
 from pgdm.config.store import compose
 from pgdm.errors import ConfigError
 from pgdm.experiment import threads
-from pgdm.library import Motion, Start, ensure, pregrasp_file
-from pgdm.library.pregrasp_file import Pregrasp
-from pgdm.library.report import Progress
-from pgdm.pregrasp import plans
+from pgdm.library import ensure, pregrasp_file
 from pgdm.pregrasp.predict import weights
-from pgdm.pregrasp.predict.candidates import Candidate, propose, ranked
-from pgdm.pregrasp.predict.predictor import Predictor
-from pgdm.pregrasp.quality import LiftTest
-from pgdm.pregrasp.reach import plan_reach
+from pgdm.pregrasp.predict.candidates import Candidate
+from pgdm.pregrasp.predict.predicted import PredictCfg, predict
+from pgdm.pregrasp.provide import store
 from pgdm.pregrasp.reach_plan import ReachPlan
 from pgdm.sim.scene import Scene, build_scene
 
 _SOURCE = "learned"
-_TRIES = 3  # candidates to which a way is planned before the best one is taken without
 
 
 @dataclass(frozen=True)
@@ -37,10 +31,8 @@ class Request:
 
     task: str
     hand: str | None
-    samples: int
-    seed: int
+    how: PredictCfg
     weights: Path | None
-    reach: bool
     image: Path | None
     offline: bool
 
@@ -61,85 +53,17 @@ def predict_pregrasp(request: Request) -> None:
     library = ensure(cfg.task.motion, request.offline, notify)
     motion = library.motion(cfg.task.motion)
     scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
-    held_out = say_training(predictor, scene)
-    num_threads = threads(cfg)
     with bars() as progress:
-        found = propose(
-            predictor, scene, lying(motion, scene), request.samples, request.seed,
-            lambda i, n: progress("samples", i, n),
-        )  # fmt: skip
-        lift = LiftTest(scene, motion.substeps, seed=request.seed, num_threads=num_threads)
-        found = ranked(found, lift, lambda i, n: progress("lift tests", i, n))
-        chosen, plan = 0, None
-        if request.reach:
-            chosen, plan = reach(scene, found, motion.substeps, request.seed, num_threads, progress)
-    best = found[chosen]
-    note = {
-        "held_out": held_out,
-        "trained_on": list(predictor.tasks),
-        "seed": request.seed,
-        "rank": chosen + 1,
-        "lift_rate": None if np.isnan(best.quality.lift_rate) else best.quality.lift_rate,
-        "fingertip_distance_m": best.quality.fingertip_distance_m,
-        "moved_m": best.moved_m,
-    }
+        made = predict(predictor, scene, motion, request.how, notify, progress, threads(cfg))
     path = pregrasp_file.path_of(scene.task.id, hand, _SOURCE)
-    pose = Start(best.qpos, np.zeros(scene.model.nv), None)
-    pregrasp_file.write(path, Pregrasp(pose, None, note))
-    if plan is not None:
-        plans.store(scene, _SOURCE, best.qpos, plan)
-    show(found, chosen)
-    if request.reach:
-        print(f"reach: candidate {chosen + 1}, {outcome(plan)}")
+    store(path, made.pregrasp)
+    show(made.candidates, made.chosen)
+    if request.how.reach:
+        print(f"reach: candidate {made.chosen + 1}, {outcome(made.plan)}")
     if request.image is not None:
-        print(f"image: {draw(scene, found, chosen, request.image)}")
+        print(f"image: {draw(scene, made.candidates, made.chosen, request.image)}")
     print(f"stored: {path}")
     print(f"to use it: pgdm-run task={scene.task.id} hand={hand} pregrasp={_SOURCE}")
-
-
-def say_training(predictor: Predictor, scene: Scene) -> bool:
-    """Tell whether the predictor has seen the object, and return whether it has not."""
-    name = scene.task.tracked_body.partition("/")[0]
-    if name not in predictor.objects:
-        notify(f"object '{name}' is held out: the predictor has seen no pre-grasp of it")
-        return True
-    notify(
-        f"object '{name}' was in the training set: this is no prediction for an unseen object. "
-        f"For one: pgdm pregrasp train --hand {predictor.hand} --leave-out {name}"
-    )
-    return False
-
-
-def lying(motion: Motion, scene: Scene) -> np.ndarray:
-    """Return a state (nq,) with the hand at its reset pose and the objects where episodes start.
-
-    Raises:
-        ConfigError: the motion does not store where they start.
-    """
-    if "mined" not in motion.starts:
-        raise ConfigError(f"motion '{motion.id}' does not store where its objects start")
-    stored, model = motion.starts["mined"].qpos, scene.model
-    return np.concatenate((np.zeros(model.nu), stored[len(stored) - (model.nq - model.nu) :]))
-
-
-def reach(
-    scene: Scene,
-    found: Sequence[Candidate],
-    substeps: int,
-    seed: int,
-    num_threads: int,
-    progress: Progress,
-) -> tuple[int, ReachPlan | None]:
-    """Return the best candidate that can be reached, and the way; if none, the best without."""
-    for i, candidate in enumerate(found[:_TRIES]):
-        plan = plan_reach(
-            scene, candidate.qpos, substeps, seed=seed, num_threads=num_threads,
-            progress=lambda done, most, _, i=i: progress(f"plan {i + 1}", done, most),
-        )  # fmt: skip
-        if plan.reached:
-            return i, plan
-        notify(f"candidate {i + 1} is not reached: {', '.join(plan.failures)}")
-    return 0, None
 
 
 def outcome(plan: ReachPlan | None) -> str:

@@ -1,7 +1,8 @@
 """Making the start that a run asks for, where there is none and it can be made by itself.
 
-Two can: ``mocap``, from a human hand's joints, and ``planned`` of a hand that is not the task's
-own: the same pre-grasp with the state in which a reach plan ends there.
+Three can: ``mocap``, from a human hand's joints; ``planned`` of a hand that is not the task's own:
+the same pre-grasp with the state in which a reach plan ends there; and ``learned``, where the user
+has trained a predictor for the hand.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from pgdm.library import Library, Motion, ensure_expert, pregrasp_file, rebuild
 from pgdm.library.pregrasp_file import Pregrasp
 from pgdm.library.report import Progress, silent
 from pgdm.pregrasp.mocap import Retargeted, check, of_task, retarget
+from pgdm.pregrasp.predict import weights
+from pgdm.pregrasp.predict.predicted import PredictCfg, predict
 from pgdm.pregrasp.reach import plan_reach
 from pgdm.pregrasp.reach_plan import OBJECT_TOLERANCE_M, ReachPlan
 from pgdm.pregrasp.recording import Recording
@@ -55,10 +58,15 @@ class Wanted:
 
     @property
     def can_be_made(self) -> bool:
-        """Whether such a start is made by itself."""
-        if self.source == "mocap":
-            return True
-        return self.source == "planned" and self.hand.name != self.own_hand.name
+        """Whether such a start is made by itself where none is stored with the motion."""
+        if self.source == "learned":
+            return weights.path_of(self.hand.name).is_file()
+        return self.source == "mocap" or (self.source == "planned" and self.is_other_hand)
+
+    @property
+    def is_other_hand(self) -> bool:
+        """Whether the hand is not the task's own: no start stored with the motion is for it."""
+        return self.hand.name != self.own_hand.name
 
 
 def ensure_start(
@@ -83,20 +91,30 @@ def ensure_start(
 
     Raises:
         ConfigError: the hand cannot take up the task.
+        SceneError: no predicted hand can be made free of contact.
+        CorruptAssetError: the predictor's file is damaged.
         LibraryError: something is missing and cannot be fetched, or the start cannot be stored.
     """
     notify = notify or _log.warning
     if not wanted.can_be_made or wanted.path.is_file():
         return
+    motion = library.motion(wanted.task.motion)
+    if not wanted.is_other_hand and wanted.source in motion.starts:
+        return
     with _locked(wanted.path, notify):
         if wanted.path.is_file():  # another process was first
             return
+        way = "a prediction" if wanted.source == "learned" else "inverse kinematics"
         notify(
             f"no start '{wanted.source}' of {wanted.task.id} with hand {wanted.hand.name} is "
-            "stored yet: making it once by inverse kinematics and a reach plan"
+            f"stored yet: making it once by {way} and a reach plan"
         )
         scene = build_scene(library, wanted.task, wanted.hand, wanted.sim)
-        motion = library.motion(wanted.task.motion)
+        if wanted.source == "learned":
+            predictor = weights.read(weights.path_of(wanted.hand.name), wanted.hand.name)
+            guess = predict(predictor, scene, motion, PredictCfg(), notify, progress, num_threads)
+            store(wanted.path, guess.pregrasp)
+            return
         recording = human_hand(library, wanted, motion, offline, notify)
         progress("inverse kinematics", 0, 1)
         made = retarget(scene, library, motion, recording)

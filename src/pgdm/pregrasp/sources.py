@@ -12,6 +12,11 @@ from pgdm.sim.scene import Scene
 
 SOURCES = ("planned", "mined", "mocap", "teleop", "labeled", "learned", "none")
 
+LIMIT_TOLERANCE = 0.1
+"""By how much, m or rad, a joint of the user's own start may be beyond its limits: limits give way
+a little in the simulation, and people's recordings do not stop at them."""
+_LEARNING = "; 'learned' is made by itself after 'pgdm pregrasp train --hand {hand}'"
+
 
 @dataclass(frozen=True)
 class PregraspCfg:
@@ -69,6 +74,8 @@ def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
         f"task '{task}' has no stored start '{cfg.source}' in source '{motion.source}'; "
         f"it has: {', '.join(sorted(set(have)))} (pregrasp=...). Stored plans come with a "
         f"TCDM checkout: pgdm assets import PATH; 'pgdm pregrasp --help' lists how to make your own"
+        + _LEARNING.format(hand=hand)
+        * (cfg.source == "learned")
     )
 
 
@@ -79,7 +86,7 @@ def _stored(source: str, motion: Motion, scene: Scene) -> StartState | None:
     if own is not None:
         reach = _reach(own.start, own.pose.qpos, scene)
         start = StartState(source, own.start.qpos, own.start.qvel, own.sha256, reach)
-        return _fitting(start, scene)
+        return _within_limits(_fitting(start, scene), scene)
     if source not in motion.starts:
         return None
     stored = motion.starts[source]
@@ -117,6 +124,21 @@ def _reset_pose(motion: Motion, scene: Scene) -> StartState:
     objects = stored[len(stored) - (model.nq - model.nu) :]
     qpos = np.concatenate((np.zeros(model.nu), objects))
     return _fitting(StartState("none", qpos, np.zeros(model.nv)), scene)
+
+
+def _within_limits(start: StartState, scene: Scene) -> StartState:
+    """Return a start of the user's own if the hand can be where it says."""
+    model, hand = scene.model, start.qpos[: scene.model.nu]
+    low, high = model.jnt_range[: model.nu].T
+    beyond = np.maximum(low - hand, hand - high)
+    worst = int(beyond.argmax())
+    if beyond[worst] > LIMIT_TOLERANCE:
+        path = pregrasp_file.path_of(scene.task.id, scene.hand.name, start.source)
+        raise ConfigError(
+            f"{path}: joint {model.joint(worst).name} is at {hand[worst]:.3f}, its limits are "
+            f"{low[worst]:.3f} to {high[worst]:.3f} (m or rad); make the pre-grasp anew"
+        )
+    return start
 
 
 def _fitting(start: StartState, scene: Scene) -> StartState:

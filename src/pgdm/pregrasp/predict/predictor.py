@@ -89,10 +89,15 @@ def example(scene: Scene, qpos: np.ndarray) -> Example | None:
     """
     if not lies_free(scene):
         return None
-    frame = GraspFrame(scene)
-    name = scene.task.tracked_body.partition("/")[0]
-    code = object_code(scene, qpos)
-    return Example(scene.task.id, name, code, frame.vector(qpos), frame.fingertips(qpos))
+    frame, code = GraspFrame(scene), object_code(scene, qpos)
+    return Example(
+        scene.task.id, object_of(scene), code, frame.vector(qpos), frame.fingertips(qpos)
+    )
+
+
+def object_of(scene: Scene) -> str:
+    """Return the library name of a scene's tracked object."""
+    return scene.task.tracked_body.partition("/")[0]
 
 
 def lies_free(scene: Scene) -> bool:
