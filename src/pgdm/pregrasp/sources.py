@@ -13,8 +13,8 @@ from pgdm.sim.scene import Scene
 SOURCES = ("planned", "mined", "mocap", "teleop", "labeled", "learned", "none")
 
 LIMIT_TOLERANCE = 0.5
-"""By how much, m or rad, a joint of the user's own start may be beyond its limits: recordings do not
-stop at them, and the published pre-grasps leave theirs by up to 0.46 rad."""
+"""By how much, m or rad, a joint of the user's own start may be beyond its limits: recordings do
+not stop at them, and published pre-grasps leave theirs by up to 0.46 rad."""
 _LEARNING = "; 'learned' is made by itself after 'pgdm pregrasp train --hand {hand}'"
 
 
