@@ -29,6 +29,7 @@ from pgdm.library import open_library
 from pgdm.library.provide import Spoken
 from pgdm.pregrasp.ik import HandIk
 from pgdm.pregrasp.mocap import of_task, retarget
+from pgdm.sim.contact import FREE_M
 from pgdm.sim.scene import Scene, build_scene
 
 FOLDER = Path(__file__).parent / "results" / "ik"
@@ -67,7 +68,7 @@ def measure(task: str, hand: str) -> dict[str, Any]:
     errors = 1e3 * made.errors_m
     found = {
         "human": motion.id in library.experts().experts,
-        "success": bool(errors.max() <= 20 and depth == 0 and inside),
+        "success": bool(errors.max() <= 20 and depth <= FREE_M and inside),
         "fingertips_mm": float(errors.mean()),
         "worst_mm": float(errors.max()),
         "depth_mm": 1e3 * depth,
@@ -115,7 +116,7 @@ def table(found: dict[str, dict[str, Any]]) -> str:
         for human, name in ((True, "human hands"), (False, "the task's own hand")):
             rows = [r for k, r in found.items() if k.endswith(f"/{hand}") and r["human"] == human]
             if rows:
-                cut = sum(r["depth_mm"] > 0 for r in rows)
+                cut = sum(r["depth_mm"] > 1e3 * FREE_M for r in rows)
                 lines.append(
                     f"| {hand} | {name} | {len(rows)} | {sum(r['success'] for r in rows)} | "
                     f"{mean(rows, 'fingertips_mm'):.1f} mm | {median(rows, 'worst_mm'):.1f} mm | "

@@ -18,9 +18,10 @@ from pgdm.config.store import compose
 from pgdm.config.suites import suite
 from pgdm.errors import ConfigError, CorruptAssetError, LibraryError, PgdmError, UnknownNameError
 from pgdm.experiment import env_builder
-from pgdm.library import animated, ensure, motion_file, open_library, own
+from pgdm.library import animated, ensure, motion_file, open_library, own, pregrasp_file
 from pgdm.library.author_object import ObjectRequest, author_object
 from pgdm.library.motion_checks import Poses, TableCheck, check_motion
+from pgdm.library.pregrasp_file import Pregrasp
 from pgdm.library.verify import damaged
 from pgdm.pregrasp import near
 from pgdm.sim.contact import HandContact
@@ -71,7 +72,15 @@ def test_keyframes_become_a_task_that_runs(brick: str) -> None:
     assert shown.code == 0 and "source own (serves the task)" in shown.out, shown.err
     with pytest.raises(LibraryError, match="object 'brick' plays in brick-lift; remove it first"):
         own.remove("brick")
-    remove_task("brick-lift")
+    # A pre-grasp of the user's is for one motion: for another one it is set aside.
+    kept = pregrasp_file.path_of("brick-lift", "dmanus", "labeled")
+    pregrasp_file.write(kept, Pregrasp(motion.starts["mined"], None, {}))
+    anew = request(MotionRequest(Path("lift.yaml"), None), pregrasp="later", replace=True)
+    noted = author_task(anew, library).pregrasp.notes[-1]
+    aside = kept.parents[1].with_name("brick-lift.before-1")
+    assert str(aside) in noted and (aside / "dmanus" / "labeled.npz").is_file()
+    pregrasp_file.write(kept, Pregrasp(motion.starts["mined"], None, {}))
+    assert remove_task("brick-lift") == kept.parents[1].with_name("brick-lift.before-2")
     assert not task_path("brick-lift").exists() and "brick-lift" not in open_library().tasks()
 
 
@@ -136,8 +145,10 @@ def test_what_is_underground_is_refused_or_raised(recorded: Path) -> None:
         ({"id": "hammer-use1"}, ConfigError, "'hammer-use1' is one of pgdm's own"),
         ({"id": "tcdm50"}, ConfigError, "'tcdm50' is one of pgdm's own"),
         ({"id": "Big Lift"}, ConfigError, "task id 'Big Lift' is not valid"),
-        ({"object": "brik"}, UnknownNameError, "unknown object 'brik'; did you mean brick"),
+        ({"object": "brik"}, UnknownNameError, "one's own 'brik'; did you mean brick"),
         ({"hand": "dhnd"}, UnknownNameError, "unknown hand 'dhnd'; did you mean dhand"),
+        ({"id": "brick"}, ConfigError, "you have an object 'brick'; choose another id"),
+        ({"object": "door"}, UnknownNameError, "unknown object for a task of one's own 'door'"),
         ({"pregrasp": "x.npz"}, ConfigError, "--pregrasp x.npz: there is no such file"),
         ({"pregrasp": "none"}, ConfigError, "neither mean, open, later, a .npz file, nor a task"),
         (

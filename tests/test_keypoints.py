@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -186,11 +187,16 @@ def test_wrong_poses_are_named(tmp_path: Path) -> None:
         lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner),
         max_leaves=12,
     ),
-    st.sampled_from(["joints", "order", "object_position"]),
+    st.sampled_from(["joints", "order", "object_position", "object_orientation"]),
 )
 def test_whatever_a_file_holds_the_error_is_ours(value: object, key: str) -> None:
-    with pytest.raises(PgdmError):
-        recording.parse({"joints": [[0.0, 0.0, 0.0]], key: value}, "file")
+    with contextlib.suppress(PgdmError):
+        recording.parse({"joints": flat_hand().tolist(), key: value}, "file")
+
+
+def test_ragged_poses_are_named() -> None:
+    with pytest.raises(CorruptAssetError, match="'object_position' is no array of numbers"):
+        recording.parse({"joints": flat_hand(), "object_position": [[0, 0, 0], [1]]}, "file")
 
 
 @given(st.integers(0, 15), st.integers(0, 2), st.floats())

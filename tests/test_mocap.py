@@ -17,7 +17,9 @@ from pgdm.config.store import compose
 from pgdm.errors import ConfigError, LibraryError
 from pgdm.experiment import assets, env_builder
 from pgdm.library import open_library, pregrasp_file
+from pgdm.library.pregrasp_file import Pregrasp
 from pgdm.pregrasp import mocap, provide
+from pgdm.pregrasp.reach_plan import ReachPlan
 from pgdm.pregrasp.recording import Recording
 from pgdm.sim.scene import Scene, build_scene
 
@@ -124,6 +126,55 @@ def test_a_folder_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatc
         provide.ensure_start(open_library(), wanted("mouse-lift", "dhand", "planned"), True)
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, None),
+        ({"base_error_m": 0.15}, "base 150"),
+        ({"finger_error_rad": 0.8}, "fingers 0.8"),
+        ({"object_moved_m": 0.02}, "object 20"),
+        ({"depth_m": 0.004}, "hand 4 mm inside"),
+    ],
+)
+def test_a_bad_plan_is_not_taken(
+    change: dict, said: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, motion = scene("mouse-lift"), open_library().motion("mouse-lift")
+    good = ReachPlan(
+        actions=np.zeros((2, one.model.nu)), state=motion.starts["planned"], base_error_m=0.0,
+        base_error_rad=0.0, finger_error_rad=0.0, object_moved_m=0.0, object_turned_rad=0.0,
+        depth_m=0.0, target_depth_m=0.0, beyond_m=0.0, beyond_rad=0.0, rounds=1, seconds=1.0,
+    )  # fmt: skip
+    monkeypatch.setattr(provide, "plan_reach", lambda *_, **__: replace(good, **change))
+    told: list[str] = []
+    asked = Pregrasp(motion.starts["mined"], None, {})
+    made = provide.with_plan(asked, one, motion, told.append)
+    assert made.note["reach"]["plan_taken"] is (said is None)
+    assert (made.reached is None) is (said is not None)
+    assert told == [] if said is None else said in told[0]
+
+
+def test_a_hand_without_a_pregrasp_is_followed_by_none() -> None:
+    motion = open_library().motion("spheremedium-relocate")
+    still = replace(motion.starts["mined"], qpos=np.zeros(36))
+    with pytest.raises(ConfigError, match="neither a human hand nor a pre-grasp"):
+        mocap.of_task(
+            open_library(),
+            scene("spheremedium-relocate"),
+            replace(motion, starts={"mined": still}, id="own"),
+        )
+
+
+def test_what_hangs_has_no_one_pose() -> None:
+    one, motion = scene("door-open"), open_library().motion("door-open")
+    frames = expert("mouse-lift").frames[:2]
+    with pytest.raises(ConfigError, match="has 2 frames, and the object of task 'door-open' hangs"):
+        mocap.retarget(one, open_library(), motion, Recording(frames, origin="mine"))
+    posed = Recording(frames[:1], np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]), "mine")
+    with pytest.raises(ConfigError, match="leave object_position and object_orientation out"):
+        mocap.retarget(one, open_library(), motion, posed)
+
+
 @pytest.mark.slow
 def test_one_process_makes_a_start_and_the_others_wait() -> None:
     said: list[str] = []
@@ -144,7 +195,7 @@ def test_one_process_makes_a_start_and_the_others_wait() -> None:
     one.path.unlink()
     ensure()
     assert one.path.read_bytes() == again  # equal assets, equal start
-    assert stored.note["reach"]["plan_taken"] is (stored.reached is not None)
+    assert stored.note["reach"]["plan_taken"] and stored.reached is not None
 
 
 @pytest.mark.slow

@@ -151,6 +151,7 @@ def changed(row: int, column: int, value: float) -> np.ndarray:
         (line(0.2)[:1], None, r"poses have shape \(1, 7\)"),
         (line(0.2), np.r_[0:29, 28.0] * 0.04, r"row 29 has time 1.12 s, not after 1.12 s"),
         (line(0.2), np.arange(29.0), "has 29 finite times for 30 rows"),
+        (line(0.2), 1e9 * np.arange(30.0), r"lasts 2.9e\+10 s; valid: 0.04 to 3600 s"),
     ],
 )
 def test_rows_that_are_no_poses_are_named(

@@ -16,11 +16,14 @@ from pgdm.config.groups import available, conf_dir
 from pgdm.config.store import compose
 from pgdm.config.suites import suites
 from pgdm.errors import ConfigError, UnknownNameError
-from pgdm.library import Library, Start, figures, motion_file, own
+from pgdm.library import Library, Start, figures, motion_file, names, own, pregrasp_file
 from pgdm.library.manifest import TaskEntry
 from pgdm.library.motion_checks import object_joints
 from pgdm.library.report import Progress, silent
 from pgdm.sim.scene import Scene, build_scene
+
+_BOUND = {o for task in ("door-open", "hammer-strike") for o in names.objects_of(task)}
+"""Objects made for one task: they hang on something, or are of several bodies."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,8 @@ def author_task(
     path.parent.mkdir(parents=True, exist_ok=True)
     with paths.replacing(path) as temp:
         temp.write_text(_text(request, found.source, motion.source), encoding="utf-8")
+    if (aside := pregrasp_file.set_aside(request.id)) is not None:
+        found.notes.append(f"pre-grasps of the task that was replaced are set aside in {aside}")
     return AuthoredTask(request.id, scene, motion, found, motion_path, path)
 
 
@@ -109,14 +114,18 @@ def task_scene(request: TaskRequest, library: Library) -> Scene:
     return build_scene(library, cfg.task, cfg.hand, cfg.sim)
 
 
-def remove_task(task: str) -> None:
+def remove_task(task: str) -> Path | None:
     """Remove a task of the user's: its motion and its file.
+
+    Returns:
+        Where its pre-grasps are set aside, or None if there are none.
 
     Raises:
         UnknownNameError: the user has no such task.
     """
     own.remove(task)
     task_path(task).unlink(missing_ok=True)
+    return pregrasp_file.set_aside(task)
 
 
 def _check(request: TaskRequest, library: Library) -> None:
@@ -128,9 +137,13 @@ def _check(request: TaskRequest, library: Library) -> None:
         )
     if request.hand not in available("hand"):
         raise UnknownNameError("hand", request.hand, available("hand"))
-    if request.object not in library.objects():
+    objects = [name for name in library.objects() if name not in _BOUND]
+    if request.object not in objects:
         raise UnknownNameError(
-            "object", request.object, library.objects(), "'pgdm author object' makes new ones"
+            "object for a task of one's own",
+            request.object,
+            objects,
+            "'pgdm author object' makes new ones",
         )
 
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pgdm.cli.pregrasp_scenes import composed
 from pgdm.cli.train import notify
 from pgdm.config.groups import available
 from pgdm.config.store import compose
 from pgdm.errors import ConfigError
-from pgdm.experiment import env_builder
-from pgdm.library import ensure
+from pgdm.experiment import assets, env_builder
 from pgdm.pregrasp.ablate import FINGERS, Ablated, ablate
 from pgdm.pregrasp.sources import start_state
 
 
-def view_ablations(task: str, image: Path | None, pregrasp: str, offline: bool) -> None:
+def view_ablations(
+    task: str, hand: str | None, image: Path | None, pregrasp: str, offline: bool
+) -> None:
     """Write the contact sheet of a task's ablated starts.
 
     Raises:
@@ -23,10 +25,10 @@ def view_ablations(task: str, image: Path | None, pregrasp: str, offline: bool) 
     if image is None or image.suffix.lower() != ".png":
         given = f"not '{image}'" if image else "and none is given"
         raise ConfigError(f"--ablations needs --image FILE that ends in .png, {given}")
-    cfg = compose([f"task={task}", f"pregrasp={pregrasp}"])
+    cfg = composed(task, hand, f"pregrasp={pregrasp}", f"offline={str(offline).lower()}")
     if cfg.pregrasp.source == "none":
         raise ConfigError("--ablations with pregrasp none: without a pre-grasp nothing is ablated")
-    builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
+    builder = env_builder(cfg, assets(cfg, notify))
     for note in builder.notes:
         notify(note)
     scene, motion = builder.scene, builder.motion

@@ -54,10 +54,10 @@ def remove(name: str, sure: bool) -> None:
     if not sure and not _confirmed(f"remove the {kind} '{name}'? Nothing brings it back"):
         print("nothing was removed")
         return
-    if kind == "task":
-        remove_task(name)
-    else:
+    if kind == "object":
         own.remove(name)
+    elif (aside := remove_task(name)) is not None:
+        print(f"its pre-grasps are kept in {aside}")
     print(f"removed the {kind} '{name}'")
 
 

@@ -125,6 +125,9 @@ def view(
     pregrasp: Annotated[
         str | None, typer.Option(help="Start that shows the hand, as in pgdm-run [planned].")
     ] = None,
+    hand: Annotated[
+        str | None, typer.Option(help="Another hand than the task's: adroit, dhand or dmanus.")
+    ] = None,
     expert: Annotated[
         bool,
         typer.Option("--expert", help="Move the hand as a person's moved; spheres show contacts."),
@@ -148,16 +151,16 @@ def view(
         raise ConfigError("--ablations and --image FILE go together, without --video or --expert")
     if reach and (ablations or expert):
         raise ConfigError("--reach goes without --ablations and --expert")
-    if expert and pregrasp is not None:
-        raise ConfigError("--expert shows the hand as it moved: leave --pregrasp out")
+    if expert and (pregrasp is not None or hand is not None):
+        raise ConfigError("--expert shows the hand as it moved: leave --pregrasp and --hand out")
     start = pregrasp or "planned"
     if ablations:
-        return view_ablations(task, image, start, offline)
+        return view_ablations(task, hand, image, start, offline)
     if reach:
-        return view_reach(task, video, start, offline)
+        return view_reach(task, hand, video, start, offline)
     if expert:
         return view_expert(task, video, offline)
-    return view_task(task, video, start, offline)
+    return view_task(task, hand, video, start, offline)
 
 
 @app.command("report")

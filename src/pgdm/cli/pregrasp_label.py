@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from types import FrameType
 
 from pgdm.cli.dashboard import free_port
+from pgdm.cli.pregrasp_scenes import composed
 from pgdm.cli.train import notify
-from pgdm.config.store import compose
 from pgdm.experiment import env_builder
 from pgdm.library import ensure
 from pgdm.pregrasp.labeler import shapes
@@ -32,8 +32,7 @@ def label(
             is open in another labeler.
     """
     # Any hand has a reset pose; its pre-grasps are looked for afterwards.
-    chosen = [f"task={task}", "pregrasp=none", *([f"hand={hand}"] if hand else [])]
-    cfg = compose(chosen)
+    cfg = composed(task, hand, "pregrasp=none")
     builder = env_builder(cfg, ensure(cfg.task.motion, offline, notify))
     scene, substeps = builder.scene, builder.motion.substeps
     poses = Poses(scene, builder.motion)

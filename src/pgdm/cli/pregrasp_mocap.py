@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.table import Table
 
 from pgdm.cli.assets import bars
+from pgdm.cli.pregrasp_scenes import composed
 from pgdm.cli.train import notify
 from pgdm.config.hands import own_hand
 from pgdm.config.schema import ExperimentCfg
-from pgdm.config.store import compose
 from pgdm.experiment import threads
 from pgdm.library import Library, Motion, Start, ensure, pregrasp_file
 from pgdm.library.pregrasp_file import Pregrasp
@@ -55,11 +55,6 @@ def mocap(
     store(wanted.path, made.pregrasp)
     _say(made, scene)
     stored(wanted.path, image, made.pregrasp, scene)
-
-
-def composed(task: str, hand: str | None) -> ExperimentCfg:
-    """Return the experiment of a task, perhaps with another hand."""
-    return compose([f"task={task}", *([f"hand={hand}"] if hand else [])])
 
 
 def planned(

@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from pgdm.cli.assets import bars
+from pgdm.cli.pregrasp_scenes import composed
 from pgdm.cli.train import notify
-from pgdm.config.store import compose
 from pgdm.errors import ConfigError
 from pgdm.experiment import threads
 from pgdm.library import ensure, pregrasp_file
@@ -46,8 +46,7 @@ def predict_pregrasp(request: Request) -> None:
     """
     if request.image is not None and request.image.suffix.lower() != ".png":
         raise ConfigError(f"--image '{request.image}' is no PNG; give a name that ends in .png")
-    overrides = [f"task={request.task}", *([f"hand={request.hand}"] if request.hand else [])]
-    cfg = compose(overrides)
+    cfg = composed(request.task, request.hand)
     hand = cfg.hand.name
     predictor = weights.read(request.weights or weights.path_of(hand), hand)
     library = ensure(cfg.task.motion, request.offline, notify)

@@ -34,9 +34,9 @@ def open_scene(task: str, hand: str | None, offline: bool) -> tuple[Scene, Motio
     return scene, library.motion(cfg.task.motion)
 
 
-def composed(task: str, hand: str | None) -> ExperimentCfg:
+def composed(task: str, hand: str | None, *overrides: str) -> ExperimentCfg:
     """Return the settings of a task, with its own hand or another."""
-    return compose([f"task={task}", *([f"hand={hand}"] if hand else [])])
+    return compose([f"task={task}", *([f"hand={hand}"] if hand else []), *overrides])
 
 
 def console() -> Console:

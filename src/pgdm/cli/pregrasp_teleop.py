@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from pgdm.cli.assets import bars
-from pgdm.cli.pregrasp_mocap import composed, planned, stored
+from pgdm.cli.pregrasp_mocap import planned, stored
+from pgdm.cli.pregrasp_scenes import composed
 from pgdm.cli.train import notify
 from pgdm.library import ensure, pregrasp_file
 from pgdm.pregrasp import demonstrations, teleop

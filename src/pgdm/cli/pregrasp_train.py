@@ -6,8 +6,6 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from pgdm.cli.assets import bars
 from pgdm.cli.progress import duration
 from pgdm.cli.train import notify
@@ -15,7 +13,7 @@ from pgdm.config.groups import available
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.store import compose
 from pgdm.errors import LibraryError, UnknownNameError
-from pgdm.library import Library, open_library, pregrasp_file
+from pgdm.library import Library, Start, animated, ensure, open_library, pregrasp_file
 from pgdm.library.catalog import CURE
 from pgdm.library.report import Progress
 from pgdm.pregrasp.predict import weights
@@ -77,6 +75,8 @@ def collect(hand: str, progress: Progress) -> list[tuple[Scene, Example]]:
         LibraryError: there is none.
     """
     library, tasks = open_library(), available("task")
+    if library.hands():  # what comes with the program is learned from too
+        library = ensure(animated.TASKS[0], True, notify)
     found: list[tuple[Scene, Example]] = []
     for i, task in enumerate(tasks):
         progress("scenes", i, len(tasks))
@@ -92,8 +92,10 @@ def collect(hand: str, progress: Progress) -> list[tuple[Scene, Example]]:
         if not poses:
             continue
         scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
-        for qpos in poses:
-            one = example(scene, qpos)
+        for start in poses:
+            if start.is_reset_pose(scene.model.nu):
+                continue
+            one = example(scene, start.qpos)
             if one is None:
                 notify(f"{task}: left out, its object hangs on something")
             else:
@@ -104,11 +106,11 @@ def collect(hand: str, progress: Progress) -> list[tuple[Scene, Example]]:
     return found
 
 
-def _poses(library: Library, cfg: ExperimentCfg, is_own_hand: bool) -> Iterator[np.ndarray]:
+def _poses(library: Library, cfg: ExperimentCfg, is_own_hand: bool) -> Iterator[Start]:
     starts = library.motion(cfg.task.motion).starts
     if is_own_hand and "mined" in starts:
-        yield starts["mined"].qpos
+        yield starts["mined"]
     for source in _OWN:
         own = pregrasp_file.find(cfg.task.id, cfg.hand.name, source)
         if own is not None:
-            yield own.pose.qpos
+            yield own.pose

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pgdm.cli.pregrasp_scenes import composed
 from pgdm.cli.train import notify
-from pgdm.config.store import compose
 from pgdm.envs.film import film_expert, film_motion, film_reach
 from pgdm.errors import ConfigError
 from pgdm.experiment import assets, env_builder
@@ -18,14 +18,16 @@ from pgdm.sim.replay import expert_marks, expert_qpos, motion_qpos
 _FAR_M = 0.01  # out of its limits by more than this the hand is not where methods have it
 
 
-def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> None:
+def view_task(
+    task: str, hand: str | None, video: Path | None, pregrasp: str, offline: bool
+) -> None:
     """Replay the motion in a window, or into an MP4.
 
     Raises:
         PgdmError: if the task is unknown, its assets are missing, or nothing can be drawn.
     """
     _check(video)
-    cfg = compose([f"task={task}", f"pregrasp={pregrasp}", f"offline={str(offline).lower()}"])
+    cfg = composed(task, hand, f"pregrasp={pregrasp}", f"offline={str(offline).lower()}")
     builder = env_builder(cfg, assets(cfg, notify))
     start, reference = builder.mdp.start, builder.mdp.reference
     for note in builder.notes:
@@ -38,7 +40,9 @@ def view_task(task: str, video: Path | None, pregrasp: str, offline: bool) -> No
     _say(video, film_motion(builder.make(1, 1), video))
 
 
-def view_reach(task: str, video: Path | None, pregrasp: str, offline: bool) -> None:
+def view_reach(
+    task: str, hand: str | None, video: Path | None, pregrasp: str, offline: bool
+) -> None:
     """Play the plan that leads to a start, in a window, or into an MP4.
 
     Raises:
@@ -47,7 +51,7 @@ def view_reach(task: str, video: Path | None, pregrasp: str, offline: bool) -> N
     """
     _check(video)
     start = f"pregrasp={pregrasp}", "pregrasp.fallback=null"
-    cfg = compose([f"task={task}", *start, f"offline={str(offline).lower()}"])
+    cfg = composed(task, hand, *start, f"offline={str(offline).lower()}")
     builder = env_builder(cfg, assets(cfg, notify))
     scene, source, reach = builder.scene, builder.mdp.start.source, builder.mdp.start.reach
     if reach is None:
@@ -70,7 +74,7 @@ def view_expert(task: str, video: Path | None, offline: bool) -> None:
     """
     _check(video)
     # The recorded pose is that of the mesh's origin: only so the fingers lie where they lay.
-    cfg = compose([f"task={task}", "method=graff", "reference=com_corrected"])
+    cfg = composed(task, None, "method=graff", "reference=com_corrected")
     library = ensure_expert(cfg.task.motion, offline, notify)
     builder = env_builder(cfg, library)
     scene, mdp, expert = builder.scene, builder.mdp, builder.expert

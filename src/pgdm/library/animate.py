@@ -24,6 +24,9 @@ from pgdm.errors import ConfigError, UnknownNameError
 STEP_S = 0.04
 """Control step of every task, s (SPEC 1: 25 Hz)."""
 
+LONGEST_S = 3600.0
+"""Longest motion that is sampled, s; what a task may last is checked afterwards."""
+
 FRAMES = ("rest", "world")
 _KEYS = ("frame", "place", "keyframes")
 _PLACE_KEYS = ("pos_m", "euler_deg", "quat")
@@ -224,13 +227,14 @@ def _keyframe(key: Any, label: str) -> Keyframe:
     if not isinstance(key, dict):
         raise ConfigError(f"{label} holds no keys; valid: {', '.join(_KEYFRAME_KEYS)}")
     _known(key, _KEYFRAME_KEYS, label)
-    if not isinstance(key.get("time_s"), int | float):
-        raise ConfigError(f"{label}: time_s is {key.get('time_s')!r}, not a number")
+    time_s = key.get("time_s")
+    if isinstance(time_s, bool) or not isinstance(time_s, int | float) or time_s != time_s:
+        raise ConfigError(f"{label}: time_s is {time_s!r}, not a number")
     stop = key.get("stop", False)
     if not isinstance(stop, bool):
         raise ConfigError(f"{label}: stop is {stop!r}; valid: true, false")
     pos = _numbers(key, "pos_m", 3, [0.0, 0.0, 0.0], label)
-    return Keyframe(float(key["time_s"]), pos, _quat(key, label), stop)
+    return Keyframe(float(time_s), pos, _quat(key, label), stop)
 
 
 def _check_times(keyframes: Sequence[Keyframe], label: str) -> None:
@@ -243,6 +247,10 @@ def _check_times(keyframes: Sequence[Keyframe], label: str) -> None:
                 f"{label}: keyframe {i + 1} at {two:g} s does not come {_MIN_GAP_S:g} s or more "
                 f"after keyframe {i} at {one:g} s"
             )
+    if times[-1] > LONGEST_S:
+        raise ConfigError(
+            f"{label}: the last keyframe is at {times[-1]:g} s; {LONGEST_S:g} s at most"
+        )
 
 
 def _quat(key: Mapping[str, Any], label: str) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from importlib.metadata import version
 
@@ -68,7 +69,7 @@ def convex_parts(mesh: SoundMesh, cfg: PartsCfg, progress: Progress = silent) ->
 
     Raises:
         ConfigError: a setting is out of range.
-        LibraryError: nothing came out.
+        LibraryError: it failed, or nothing came out.
     """
     cfg.check()
     cache = paths.home() / "parts" / f"{_key(mesh, cfg)}.npz"
@@ -124,17 +125,32 @@ def _decomposed(mesh: SoundMesh, cfg: PartsCfg) -> list[tuple[np.ndarray, np.nda
 def _in_background(
     work: Callable[[], list[tuple[np.ndarray, np.ndarray]]], progress: Progress
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Do the work in a thread of its own, so that Ctrl-C ends the program at once."""
-    results: list[list[tuple[np.ndarray, np.ndarray]]] = []
-    thread = threading.Thread(target=lambda: results.append(work()), daemon=True)
-    thread.start()
+    """Do the work in a thread of its own, so that Ctrl-C ends the program at once.
+
+    Raises:
+        LibraryError: the work failed.
+    """
+    done: Future[list[tuple[np.ndarray, np.ndarray]]] = Future()
+
+    def run() -> None:
+        try:
+            done.set_result(work())
+        except Exception as error:  # noqa: BLE001 - the caller is told
+            done.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
     waited = 0.0
-    while thread.is_alive():
-        thread.join(_POLL_S)
+    while not done.done():
+        wait([done], _POLL_S)
         waited += _POLL_S
         seconds = int(waited)
         progress("convex parts, s", seconds, max(_TYPICAL_S, seconds + 5))
-    return results[0] if results else []
+    if (error := done.exception()) is not None:
+        raise LibraryError(
+            f"the mesh could not be taken apart ({type(error).__name__}: {error}); repair it in "
+            "the program that made it, or try another --threshold"
+        ) from error
+    return done.result()
 
 
 def _sound(raw: list[tuple[np.ndarray, np.ndarray]]) -> list[Part]:

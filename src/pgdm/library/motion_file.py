@@ -32,6 +32,10 @@ class Start:
     actions: np.ndarray | None = field(repr=False)
     """Normalised actions (K, nu) of the reach plan that leads here, where one is stored."""
 
+    def is_reset_pose(self, num_hand_joints: int) -> bool:
+        """Return whether the hand, first in qpos, is at its reset pose: then it is no pre-grasp."""
+        return not self.qpos[:num_hand_joints].any()
+
 
 @dataclass(frozen=True)
 class Motion:

@@ -64,6 +64,8 @@ def check_object_name(name: str, replace: bool) -> None:
         raise ConfigError(f"object name '{name}' is the library's own; choose another one")
     if name in own.objects and not replace:
         raise ConfigError(f"you have an object '{name}' already; --replace makes it anew")
+    if name in own.tasks:
+        raise ConfigError(f"you have a task '{name}'; choose another name for the object")
 
 
 def check_task_name(task: str, shipped: Collection[str], replace: bool) -> None:
@@ -84,8 +86,11 @@ def check_task_name(task: str, shipped: Collection[str], replace: bool) -> None:
         )
     if task in (*shipped, *_benchmark_tasks()):
         raise ConfigError(f"task id '{task}' is one of pgdm's own; choose another one")
-    if task in read().tasks and not replace:
+    own = read()
+    if task in own.tasks and not replace:
         raise ConfigError(f"you have a task '{task}' already; --replace makes it anew")
+    if task in own.objects:
+        raise ConfigError(f"you have an object '{task}'; choose another id, such as {task}-lift")
 
 
 def add_object(name: str, make: Callable[[Path], list[str]], origin: str, licence: str) -> Path:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pgdm.errors import ConfigError, CorruptAssetError
 from pgdm.library import safe_npz
-from pgdm.library.animate import STEP_S, continuous
+from pgdm.library.animate import LONGEST_S, STEP_S, continuous
 
 SUFFIXES = (".csv", ".npz", ".json")
 """Formats that are read."""
@@ -110,8 +110,10 @@ def _check_times(times: np.ndarray, count: int, label: str) -> None:
         raise CorruptAssetError(
             f"{label}: row {bad} has time {times[bad]:g} s, not after {times[bad - 1]:g} s"
         )
-    if times[-1] - times[0] < STEP_S:
-        raise CorruptAssetError(f"{label}: lasts {times[-1] - times[0]:g} s, not a control step")
+    if not STEP_S <= times[-1] - times[0] <= LONGEST_S:
+        raise CorruptAssetError(
+            f"{label}: lasts {times[-1] - times[0]:g} s; valid: {STEP_S:g} to {LONGEST_S:g} s"
+        )
 
 
 def _first(wrong: Any) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import itertools
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -64,6 +65,24 @@ def find(task: str, hand: str, source: str) -> Pregrasp | None:
 def own(task: str, hand: str) -> list[str]:
     """Return of which sources the user has a pre-grasp."""
     return [source for source in SOURCES if path_of(task, hand, source).is_file()]
+
+
+def set_aside(task: str) -> Path | None:
+    """Give the user's pre-grasps of a task another place, as they fit it no more.
+
+    Returns:
+        Where they are now, or None if there were none.
+    """
+    folder = paths.user() / "pregrasps" / task
+    if not folder.is_dir():
+        return None
+    aside = next(
+        path
+        for i in itertools.count(1)
+        if not (path := folder.with_name(f"{task}.before-{i}")).exists()
+    )
+    folder.rename(aside)
+    return aside
 
 
 def write(path: Path, pregrasp: Pregrasp) -> None:

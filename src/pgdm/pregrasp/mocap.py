@@ -20,6 +20,7 @@ from pgdm.pregrasp.ik import REACHED_M, HandIk, IkResult, solve_hand
 from pgdm.pregrasp.keypoints import Keypoints
 from pgdm.pregrasp.recording import Recording
 from pgdm.pregrasp.targets import HandShape
+from pgdm.sim.contact import FREE_M
 from pgdm.sim.scene import Scene
 
 FAR_M = 0.05
@@ -57,7 +58,7 @@ class Retargeted:
         slides = [name for name in self.result.at_limit if _is_slide(name)]
         if slides:
             said.append(f"the base is at the end of {', '.join(slides)}")
-        if self.result.depth_m > 0:
+        if self.result.depth_m > FREE_M:
             said.append(f"the hand cuts {1e3 * self.result.depth_m:.1f} mm into something")
         return said
 
@@ -123,8 +124,9 @@ def of_task(library: Library, own: Scene, motion: Motion) -> Recording:
     if motion.id in library.experts().experts:
         return of_expert(library.expert(motion.id), motion)
     for source in ("mined", "planned", "learned"):
-        if source in motion.starts:
-            return of_hand(own, motion.starts[source])
+        start = motion.starts.get(source)
+        if start is not None and not start.is_reset_pose(own.model.nu):
+            return of_hand(own, start)
     raise ConfigError(
         f"task '{own.task.id}' has neither a human hand nor a pre-grasp of its own to follow; give "
         "a file: pgdm pregrasp mocap TASK --file FILE"
@@ -138,11 +140,17 @@ def frame_before_contact(recording: Recording, library: Library, scene: Scene) -
     known or the hand touches from the first frame on; the last one where it never does.
 
     Raises:
+        ConfigError: the object hangs on something, so that one pose does not tell where it is.
         CorruptAssetError: the object has no parts to touch.
     """
     count, position, orientation = len(recording.frames), recording.position, recording.orientation
     if count == 1 or position is None or orientation is None:
         return 0
+    if not scene.lies_free:
+        raise ConfigError(
+            f"{recording.origin}: has {count} frames, and the object of task '{scene.task.id}' "
+            "hangs on something, so that contact cannot be seen: say which one with --frame"
+        )
     xml = library.object_xml(scene.task.objects[0], scene.asset_source)
     joints = np.stack([hand.joints for hand in recording.frames])
     near = expert_contacts.measure(xml, position, orientation, joints).distances
@@ -173,7 +181,8 @@ def retarget(
         seed: of the search.
 
     Raises:
-        ConfigError: there is no such frame, or the hand's points cannot follow a human hand.
+        ConfigError: there is no such frame, the hand's points cannot follow a human hand, or the
+            recording has poses of an object that hangs on something.
     """
     objects = object_joints(motion, scene)
     recording = _placed(recording, scene, objects)
@@ -214,11 +223,18 @@ def _placed(recording: Recording, scene: Scene, objects: np.ndarray) -> Recordin
     data.qpos[scene.model.nu :] = objects
     mujoco.mj_kinematics(scene.model, data)
     body, count = scene.index.object_body, len(recording.frames)
+    while scene.model.body_parentid[body]:  # a recorded pose is that of the mesh's origin
+        body = int(scene.model.body_parentid[body])
     there, turn = data.xpos[body].copy(), data.xmat[body].reshape(3, 3).copy()
     position = np.repeat(there[None], count, axis=0)
     orientation = np.repeat(data.xquat[body][None], count, axis=0)
     if recording.position is None or recording.orientation is None:
         return replace(recording, position=position, orientation=orientation)
+    if not scene.lies_free:
+        raise ConfigError(
+            f"{recording.origin}: the object of task '{scene.task.id}' hangs on something; leave "
+            "object_position and object_orientation out, the hand's joints in the task's world"
+        )
     frames, was = [], np.empty(9)
     for hand, place, quaternion in zip(
         recording.frames, recording.position, recording.orientation, strict=True

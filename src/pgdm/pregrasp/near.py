@@ -17,6 +17,7 @@ import numpy as np
 from pgdm import seeding
 from pgdm.cem import CemCfg, CrossEntropy
 from pgdm.errors import SceneError
+from pgdm.pregrasp.waypoints import opposing_finger
 from pgdm.sim.contact import FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
@@ -35,6 +36,7 @@ _WEIGHTS = {
     "across": 0.03,
     "posture": 0.01,  # a radian^2 of the fingers away from their posture
     "wrist": 0.01,  # a radian^2 of the wrist away from its rest
+    "tendons": 0.1,  # a radian that joints are apart which a tendon couples
     "beyond": 5.0,
 }
 
@@ -114,6 +116,10 @@ class _Search:
         self._scale = np.full(nu, _SPREAD[2])
         self._scale[:3], self._scale[3:base] = _SPREAD[0], _SPREAD[1]
         self._tips = scene.index.point_geoms[scene.index.fingertips]
+        thumb = opposing_finger(scene, self._contact)
+        of_tip = [self._contact.finger_of_geom(tip) for tip in self._tips.tolist()]
+        self._thumb = np.array(of_tip) == thumb  # (F,)
+        self._tendons = _Tendons(model)
         self._distance = FingertipDistance(scene)
 
     def run(self, stream: np.random.Generator, first: bool) -> NearPose | None:
@@ -150,8 +156,7 @@ class _Search:
         tips = data.geom_xpos[self._tips]
         ways = tips - com
         ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-6)
-        # The thumb is each hand's last finger.
-        across = np.linalg.norm(ways[-1] + ways[:-1].mean(axis=0))
+        across = np.linalg.norm(ways[self._thumb].mean(axis=0) + ways[~self._thumb].mean(axis=0))
         fingers = joints[self._first :] - self._posture[self._first :]
         terms = {
             "depth": depth,
@@ -159,6 +164,7 @@ class _Search:
             "across": float(across),
             "posture": float((fingers**2).mean()),
             "wrist": float((joints[3 : self._first] ** 2).mean()),
+            "tendons": self._tendons.beyond_rad(data),
             "beyond": self._beyond(np.concatenate((joints, self._qpos[self._nu :]))),
         }
         cost = float(np.abs(distances - TIP_DISTANCE_M).mean())
@@ -169,11 +175,12 @@ class _Search:
         self._data.qpos[: self._nu] = joints
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
+        mujoco.mj_tendon(self._model, self._data)
 
     def _middle(self) -> np.ndarray:
         """Return the point (3,) m, world frame, between the thumb's tip and the others."""
         tips = self._data.geom_xpos[self._tips]
-        return 0.5 * (tips[-1] + tips[:-1].mean(axis=0))
+        return 0.5 * (tips[self._thumb].mean(axis=0) + tips[~self._thumb].mean(axis=0))
 
     def _centred(self, joints: np.ndarray) -> np.ndarray:
         """Return joints with the slides moved so that the fingertips are around the object."""
@@ -184,3 +191,25 @@ class _Search:
         moved = joints.copy()
         moved[:3] += mount.reshape(3, 3).T @ way
         return moved.clip(self._low, self._high)
+
+
+class _Tendons:
+    """Tells how far joints are beyond what tendons with a limit allow: no servo brings them there.
+
+    Args:
+        model: its fixed tendons are measured, whose length is a sum of joints times arms.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        fixed = model.wrap_type[model.tendon_adr] == mujoco.mjtWrap.mjWRAP_JOINT
+        self._which = np.flatnonzero(fixed & (model.tendon_limited != 0))
+        first, count = model.tendon_adr[self._which], model.tendon_num[self._which]
+        spans = zip(first.tolist(), (first + count).tolist(), strict=True)
+        self._arms = np.array([np.abs(model.wrap_prm[a:b]).max() for a, b in spans])  # m/rad
+        self._range = model.tendon_range[self._which]
+
+    def beyond_rad(self, data: mujoco.MjData) -> float:
+        """Return the sum over the tendons, as an angle of the joint with the longest arm."""
+        length = data.ten_length[self._which]
+        over = np.maximum(self._range[:, 0] - length, length - self._range[:, 1]).clip(0.0)
+        return float((over / self._arms).sum())

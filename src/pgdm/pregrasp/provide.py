@@ -24,7 +24,12 @@ from pgdm.pregrasp.mocap import Retargeted, check, of_task, retarget
 from pgdm.pregrasp.predict import weights
 from pgdm.pregrasp.predict.predicted import PredictCfg, predict
 from pgdm.pregrasp.reach import plan_reach
-from pgdm.pregrasp.reach_plan import OBJECT_TOLERANCE_M, ReachPlan
+from pgdm.pregrasp.reach_plan import (
+    BASE_TOLERANCE_M,
+    JOINT_TOLERANCE_RAD,
+    OBJECT_TOLERANCE_M,
+    ReachPlan,
+)
 from pgdm.pregrasp.recording import Recording
 from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
 
@@ -34,6 +39,8 @@ LOCK_TIMEOUT_S = 3600.0
 """How long to wait for another process that makes the same start."""
 DEEPER_M = 0.001
 """A plan that ends deeper in something than this is not taken."""
+FARTHEST = 3.0
+"""Nor one that ends farther from the pre-grasp than so many times the reach's tolerances."""
 
 _log = logging.getLogger(__name__)
 
@@ -152,8 +159,8 @@ def with_plan(
 ) -> Pregrasp:
     """Return a pre-grasp with the state in which a reach plan ends there.
 
-    A plan that pushes the object away or ends in something is not taken: then an episode starts at
-    the pose itself, set.
+    A plan that pushes the object away, ends in something or far from the pre-grasp is not taken:
+    then an episode starts at the pose itself, set.
     """
 
     def tell(done: int, rounds: int, cost: float) -> None:
@@ -162,15 +169,18 @@ def with_plan(
     plan = plan_reach(
         scene, pregrasp.pose.qpos, motion.substeps, num_threads=num_threads, progress=tell
     )
-    usable = plan.object_moved_m < OBJECT_TOLERANCE_M and (
-        plan.depth_m <= max(plan.target_depth_m, DEEPER_M)
+    off = max(
+        plan.base_error_m / BASE_TOLERANCE_M,
+        max(plan.base_error_rad, plan.finger_error_rad) / JOINT_TOLERANCE_RAD,
     )
+    deep = plan.depth_m > max(plan.target_depth_m, DEEPER_M)
+    usable = off <= FARTHEST and plan.object_moved_m < OBJECT_TOLERANCE_M and not deep
     figures = _figures(plan) | {"plan_taken": usable}
     if not usable:
         notify(
-            f"the reach plan of {scene.task.id} with hand {scene.hand.name} moves the object "
-            f"{1e3 * plan.object_moved_m:.0f} mm and ends {1e3 * plan.depth_m:.1f} mm in "
-            "something: episodes start at the pre-grasp itself, set kinematically"
+            f"the reach plan of {scene.task.id} with hand {scene.hand.name} is not taken "
+            f"({'; '.join(plan.failures)}): episodes start at the pre-grasp itself, set "
+            "kinematically"
         )
     return replace(
         pregrasp,

@@ -13,11 +13,9 @@ from pgdm.errors import ConfigError
 from pgdm.library import Start
 from pgdm.pregrasp.flexion import Flexion
 from pgdm.sim.batch import SimBatch
-from pgdm.sim.contact import FingertipDistance, HandContact
+from pgdm.sim.contact import FREE_M, FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
-FREE_M = 1e-4
-"""A hand that is less deep in something touches nothing: below what a solver can tell."""
 LIFT_M = 0.02
 """How far the object's centre of mass must rise: as much as earns the reward's bonus (SPEC 1)."""
 CARRY_M = 0.1

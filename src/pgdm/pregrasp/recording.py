@@ -118,7 +118,10 @@ def _pose(
 ) -> np.ndarray | None:
     if key not in arrays:
         return None
-    value = np.asarray(arrays[key])
+    try:
+        value = np.asarray(arrays[key], np.float64)
+    except (TypeError, ValueError) as error:
+        raise CorruptAssetError(f"{label}: '{key}' is no array of numbers") from error
     value = value[None] if value.ndim == 1 else value
     return numbers({key: value}, key, label, (frames, size))
 

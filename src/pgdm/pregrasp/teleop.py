@@ -16,7 +16,7 @@ from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.library import Start
 from pgdm.library.pregrasp_file import Pregrasp
 from pgdm.pregrasp.demonstrations import Demonstration
-from pgdm.sim.contact import HandContact
+from pgdm.sim.contact import FREE_M, HandContact
 from pgdm.sim.scene import Scene
 
 LASTING_STEPS = 5
@@ -70,7 +70,7 @@ class Replay:
     shift_m: float
     """How far the object stood from where the task has it."""
     beyond_m: float
-    """By how much the slides would have to leave their ranges, the worst step before the cut."""
+    """By how much the slides would have to leave their ranges at the step before it takes hold."""
     palm_error_m: float
     """Worst distance of the palm from where it was observed, before slides were clipped: what of it
     the vertical and sideways slides have to make up, which the demonstrations' hand does not have.
@@ -190,6 +190,10 @@ def cut(scene: Scene, made: Replay, objects: np.ndarray, origin: str) -> Pregras
     while step > 0 and contact.depth(qpos) > 0:
         step -= 1
         qpos[: scene.model.nu] = made.qpos[step, : scene.model.nu]
+    if (depth := contact.depth(qpos)) > FREE_M:
+        raise ConfigError(
+            f"{label}: the hand is inside something from the first step on ({1e3 * depth:.1f} mm)"
+        )
     note: dict[str, Any] = {
         "made_by": "tele-operation",
         "from": origin,
@@ -199,7 +203,7 @@ def cut(scene: Scene, made: Replay, objects: np.ndarray, origin: str) -> Pregras
         "object_shift_mm": round(1e3 * made.shift_m, 1),
         "beyond_range_mm": round(1e3 * made.beyond_m, 1),
         "palm_error_mm": round(1e3 * made.palm_error_m, 1),
-        "depth_mm": round(1e3 * contact.depth(qpos), 2),
+        "depth_mm": round(1e3 * depth, 2),
     }
     return Pregrasp(Start(qpos, np.zeros(scene.model.nv), None), None, note)
 

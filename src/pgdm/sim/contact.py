@@ -7,6 +7,8 @@ import numpy as np
 
 from pgdm.sim.scene import Scene
 
+FREE_M = 1e-4
+"""A hand that is less deep in something touches nothing: below what a solver can tell."""
 FAR_M = 0.5
 """Fingertips farther than this from the object count as this far."""
 

@@ -104,6 +104,9 @@ class SimCfg:
     """Iterations of the noslip solver per physics step."""
 
 
+_FREE_JOINTS = 6  # three slides and three hinges, as the benchmark has them
+
+
 @dataclass(frozen=True)
 class SceneIndex:
     """Ids and constants of a scene, looked up by name once."""
@@ -132,6 +135,15 @@ class Scene:
     hand: HandCfg
     asset_source: str
     """The library's source that serves the task's assets, or its sources: ``own+checkout``."""
+
+    @property
+    def lies_free(self) -> bool:
+        """Whether the tracked object hangs on nothing: six joints between it and the world."""
+        body, joints = self.index.object_body, 0
+        while body:
+            joints += int(self.model.body_jntnum[body])
+            body = int(self.model.body_parentid[body])
+        return joints == _FREE_JOINTS
 
     def digest(self) -> str:
         """Return a SHA-256 over all that the physics depends on: equal scenes move equally."""

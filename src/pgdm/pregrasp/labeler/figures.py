@@ -9,8 +9,7 @@ import numpy as np
 
 from pgdm.pregrasp.labeler import names
 from pgdm.pregrasp.labeler.kinematics import Kinematics
-from pgdm.pregrasp.quality import FREE_M
-from pgdm.sim.contact import FingertipDistance
+from pgdm.sim.contact import FREE_M, FingertipDistance
 from pgdm.sim.scene import Scene
 
 BEYOND = 0.01

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from collections.abc import Mapping
@@ -216,7 +215,7 @@ class Draft:
     def __init__(self, scene: Scene) -> None:
         self._scene, self._path = scene, draft_path(scene)
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._lock = FileLock(self._path.with_suffix(".lock"), timeout=0)
+        self._lock = FileLock(self._path.with_name(f".{self._path.stem}.lock"), timeout=0)
         try:
             self._lock.acquire()
         except Timeout:
@@ -270,9 +269,7 @@ class Draft:
         self._changed.set()
         self._thread.join()
         self._write()
-        self._lock.release()
-        with contextlib.suppress(OSError):
-            Path(self._lock.lock_file).unlink()
+        self._lock.release()  # its file stays: who waits for it holds it by now
 
     def _run(self) -> None:
         while not self._ended:

@@ -12,7 +12,7 @@ from pgdm.errors import ConfigError, SceneError
 from pgdm.library import Start
 from pgdm.pregrasp.predict.encoding import object_code
 from pgdm.pregrasp.predict.grasp_vector import GraspFrame
-from pgdm.pregrasp.predict.predictor import Predictor, lies_free
+from pgdm.pregrasp.predict.predictor import Predictor
 from pgdm.pregrasp.predict.refine import freed
 from pgdm.pregrasp.quality import LiftTest, Quality, quality
 from pgdm.sim.scene import Scene
@@ -65,12 +65,17 @@ def propose(
             f"the predictor is for hand '{predictor.hand}', task '{scene.task.id}' has "
             f"'{scene.hand.name}'"
         )
-    if not lies_free(scene):
+    if not scene.lies_free:
         raise ConfigError(
             f"the object of task '{scene.task.id}' hangs on something: pre-grasps are predicted "
             "for objects that lie free"
         )
     frame = GraspFrame(scene, predictor.anchor_m)
+    if len(predictor.mean) != frame.size:
+        raise ConfigError(
+            f"the predictor of hand '{predictor.hand}' gives {len(predictor.mean)} numbers, in "
+            f"task '{scene.task.id}' it has {frame.size}: train it anew (pgdm pregrasp train)"
+        )
     vectors = predictor.sample(object_code(scene, objects), OVERSAMPLING * count, seed)
     return free_ones(frame, vectors, objects, seed, progress)[:count]
 

@@ -68,12 +68,13 @@ def read(path: Path, hand: str) -> Predictor:
         tasks, objects, left_out = (tuple(map(str, content[name])) for name in _NAMES)
     except (KeyError, TypeError, ValueError) as problem:
         raise CorruptAssetError(f"{path}: lacks or spoils {problem}; {cure} anew") from problem
-    size = len(arrays["mean"])
+    size = arrays["mean"].size
     wanted = {
+        "mean": (size,),
         "anchor_m": (3,),
         "code_mean": (BASIS_POINTS,),
         "slope": (BASIS_POINTS, size),
-        "factor": (len(arrays["factor"]), size),
+        "factor": (*arrays["factor"].shape[:1], size),
     }
     for name, shape in wanted.items():
         if arrays[name].shape != shape:
