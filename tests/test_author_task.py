@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from command_line import TINY, command
 from pgdm.author import TaskRequest, author_task
 from pgdm.author.motion import MotionRequest
 from pgdm.author.task import remove_task, task_path
+from pgdm.cem import CemCfg
 from pgdm.config.store import compose
 from pgdm.config.suites import suite
 from pgdm.errors import ConfigError, CorruptAssetError, LibraryError, PgdmError, UnknownNameError
@@ -24,6 +27,7 @@ from pgdm.library.motion_checks import Poses, TableCheck, check_motion
 from pgdm.library.pregrasp_file import Pregrasp
 from pgdm.library.verify import damaged
 from pgdm.pregrasp import near
+from pgdm.pregrasp.reach import REACH, plan_reach
 from pgdm.sim.contact import HandContact
 from recorded_poses import line
 
@@ -40,6 +44,8 @@ def brick(library_home: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     del library_home
     for name, count in {"STARTS": 2, "ROUNDS": 12}.items():
         monkeypatch.setattr(near, name, count)
+    hurry = replace(REACH, cem=CemCfg(8, 2), rounds=2, steps=10)
+    monkeypatch.setattr("pgdm.author.task.plan_reach", partial(plan_reach, cfg=hurry))
     trimesh.creation.box((0.05, 0.06, 0.12)).export("brick.stl")
     author_object(ObjectRequest(Path("brick.stl"), "brick", mass_kg=0.15))
     Path("lift.yaml").write_text(LIFT)

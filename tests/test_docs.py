@@ -140,7 +140,7 @@ def test_recipes_for_an_object_and_its_task(
     for words in made:
         outcome = command("pgdm", *words)
         assert outcome.code == 0, outcome.err
-    run = ["task=wedge-slide", "pregrasp=mined", "action=residual", "algo=ppo_fast"]
+    run = ["task=wedge-slide", "action=residual", "algo=ppo_fast"]
     done = command("pgdm-run", *run, *TINY, "--offline", "run_dir=run")
     assert done.code == 0, done.err
     assert command("pgdm", "author", "remove", "wedge-slide", "--yes").code == 0
@@ -162,7 +162,7 @@ def test_the_worked_example_of_authoring(tmp_path: Path, library_home: Path) -> 
     for words in _author_commands("authoring.md", "A worked example"):
         outcome = command("pgdm", *words)
         assert outcome.code == 0, outcome.err
-    run = ["task=pawn-lift", "pregrasp=mined", "action=residual", "algo=ppo_fast"]
+    run = ["task=pawn-lift", "action=residual", "algo=ppo_fast"]
     done = command("pgdm-run", *run, *TINY, "--offline", "run_dir=run")
     assert done.code == 0, done.err
 

@@ -20,6 +20,9 @@ from pgdm.library import Library, Start, figures, motion_file, names, own, pregr
 from pgdm.library.manifest import TaskEntry
 from pgdm.library.motion_checks import object_joints
 from pgdm.library.report import Progress, silent
+from pgdm.pregrasp import plans
+from pgdm.pregrasp.reach import plan_reach
+from pgdm.pregrasp.reach_plan import ReachPlan
 from pgdm.sim.scene import Scene, build_scene
 
 _BOUND = {o for task in ("door-open", "hammer-strike") for o in names.objects_of(task)}
@@ -51,6 +54,8 @@ class AuthoredTask:
     scene: Scene
     motion: CheckedMotion
     pregrasp: FoundPregrasp
+    plan: ReachPlan | None
+    """That was tried to bring the hand there; None for the reset pose. Stored if it reaches."""
     motion_path: Path
     task_path: Path
 
@@ -101,7 +106,19 @@ def author_task(
         temp.write_text(_text(request, found.source, motion.source), encoding="utf-8")
     if (aside := pregrasp_file.set_aside(request.id)) is not None:
         found.notes.append(f"pre-grasps of the task that was replaced are set aside in {aside}")
-    return AuthoredTask(request.id, scene, motion, found, motion_path, path)
+    plan = None if start.is_reset_pose(scene.model.nu) else _reached(scene, found.qpos, progress)
+    if plan is not None and plan.reached:
+        plans.store(scene, "mined", found.qpos, plan)
+    return AuthoredTask(request.id, scene, motion, found, plan, motion_path, path)
+
+
+def _reached(scene: Scene, qpos: np.ndarray, progress: Progress) -> ReachPlan:
+    """Plan the hand's way to the pre-grasp (nq,)."""
+
+    def tell(done: int, rounds: int, cost: float) -> None:
+        progress("reach plan", done, rounds)
+
+    return plan_reach(scene, qpos, figures.SUBSTEPS, progress=tell)
 
 
 def task_scene(request: TaskRequest, library: Library) -> Scene:

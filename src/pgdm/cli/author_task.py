@@ -9,6 +9,7 @@ import torch
 
 from pgdm.author import AuthoredTask, TaskRequest, author_task
 from pgdm.cli.assets import bars
+from pgdm.cli.pregrasp_predict import outcome
 from pgdm.cli.train import notify
 from pgdm.errors import RenderError
 from pgdm.library import Library, ensure, figures, open_library
@@ -36,10 +37,17 @@ def print_task(request: TaskRequest, offline: bool) -> None:
     print(f"motion:  {made.motion_path}")
     print(f"file:    {made.task_path}")
     _draw(made, made.motion_path.with_suffix(".png"))
-    if request.pregrasp == "later":
+    if made.plan is None:
         print(f"next:    pgdm pregrasp label {made.id}")
+        return
+    if made.plan.reached:
+        print(f"reach:   {outcome(made.plan)}")
     else:
-        print(f"next:    pgdm-run task={made.id} pregrasp=mined action=residual algo=ppo_fast")
+        print(
+            f"reach:   the pre-grasp is not reached ({'; '.join(made.plan.failures)}): episodes "
+            "start at the pose itself"
+        )
+    print(f"next:    pgdm-run task={made.id} action=residual algo=ppo_fast")
 
 
 def _with_hands(offline: bool) -> Library:
