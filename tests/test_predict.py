@@ -154,6 +154,17 @@ def test_training_learns_what_depends_on_the_shape(library_home: Path) -> None:
     np.testing.assert_allclose(mean.expected(examples[0].code), np.mean(vectors, axis=0))
 
 
+def test_one_object_held_in_several_ways_teaches_no_shape(library_home: Path) -> None:
+    """Its codes differ by how it was put down; that is not what tells objects apart."""
+    examples, frame = made_up(2)
+    ways = [
+        replace(examples[0], code=examples[0].code + 1e-5 * i, vector=examples[i % 2].vector)
+        for i in range(4)
+    ]
+    found = fit([*ways, examples[1]], frame)
+    assert found.error_m == pytest.approx(found.mean_hand_error_m, rel=0.05)
+
+
 def test_samples_depend_on_the_seed_alone_and_begin_with_the_mean(library_home: Path) -> None:
     examples, frame = made_up()
     predictor, code = fit(examples, frame), examples[3].code

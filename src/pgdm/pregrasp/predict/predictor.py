@@ -25,6 +25,9 @@ SPREAD = 0.7
 """Share of the held-out errors' spread that samples have: candidates are few, and the outer ones
 are rarely the best (best of 8 within 36 mm, with the whole spread 38 mm)."""
 LEAST_OBJECTS = 2
+_LEAST_VARIANCE = 0.5
+"""Of codes; 32 objects have 3.4, ten 0.9. Below it they are one shape, whose small differences (how
+it was put down) would be taken for what tells objects apart."""
 
 Progress = Callable[[int, int], None]
 """Told how many steps of how many are done."""
@@ -190,7 +193,7 @@ class _Ridge:
     def __init__(self, codes: np.ndarray, vectors: np.ndarray, penalty: float) -> None:
         self.code_mean, self.mean = codes.mean(axis=0), vectors.mean(axis=0)
         x, y = codes - self.code_mean, vectors - self.mean
-        variance = max(float((x**2).sum()) / len(x), 1e-12)
+        variance = max(float((x**2).sum()) / len(x), _LEAST_VARIANCE)
         if np.isinf(penalty):
             self.slope = np.zeros((x.shape[1], y.shape[1]))
             return
