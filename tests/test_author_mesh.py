@@ -33,7 +33,25 @@ def test_a_hole_is_filled_and_said() -> None:
     mesh.update_faces(mesh.face_normals[:, 2] < 0.5)  # the lid is gone
     found = author_mesh.read(saved(mesh))
     assert found.closed and found.volume_m3 == pytest.approx(VOLUME, rel=1e-5)
-    assert any("filled holes with 2 faces" in repair for repair in found.repairs)
+    assert any("filled a hole with 4 faces" in repair for repair in found.repairs)
+
+
+def test_a_round_hole_is_filled() -> None:
+    can = trimesh.creation.cylinder(radius=0.03, height=0.1, sections=32)
+    volume = can.volume
+    can.update_faces(can.face_normals[:, 2] < 0.5)
+    found = author_mesh.read(saved(can))
+    assert found.closed and found.volume_m3 == pytest.approx(volume, rel=1e-6)
+    assert any("filled a hole with 32 faces, 1" in repair for repair in found.repairs)
+
+
+def test_pieces_that_touch_along_an_edge_are_closed() -> None:
+    """Equal vertices are merged: then that edge has four faces."""
+    pieces = [trimesh.creation.box((0.04, 0.04, 0.04)) for _ in range(2)]
+    pieces[1].apply_translation([0.04, 0.04, 0.0])
+    bracket = trimesh.util.concatenate(pieces)
+    found = author_mesh.read(saved(bracket))
+    assert found.closed and found.volume_m3 == pytest.approx(2 * 0.04**3, rel=1e-6)
 
 
 def test_an_opening_is_as_large_as_its_lid() -> None:

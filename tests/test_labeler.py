@@ -191,7 +191,10 @@ def test_figures_tell_what_is_inside_what() -> None:
     assert {touch.part for touch in figures.touches} <= {
         *(f.name for f in state.kinematics.fingers),
         "palm",
+        "forearm",
     }
+    parts = {t.part for t in figures.touches if t.body == "table"}
+    assert "forearm" in parts and "palm" not in parts
     assert all(state.scene.model.body(b).name.startswith("adroit/") for b in figures.links)
     assert f"{1e3 * figures.depth_m:.1f} mm inside" in figures.reason
     depths = [touch.depth_m for touch in figures.touches]
@@ -281,7 +284,7 @@ def test_what_is_saved_starts_a_run(task: str, hand: str | None) -> None:
     assert builder.mdp.start.source == "labeled"
     np.testing.assert_array_equal(builder.mdp.start.qpos, state.qpos)
     assert not builder.mdp.start.qvel.any()
-    assert poses_of(task, hand).first().origin == "your labeled pre-grasp"
+    assert poses_of(task, hand).first().origin == "own labeled pre-grasp"
 
 
 def test_pose_that_touches_something_is_saved_only_on_purpose() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+_FEW = 12  # names that are all shown
+
 
 class PgdmError(Exception):
     """Base of all errors that pgdm raises on purpose; commands print it as one line."""
@@ -27,12 +29,12 @@ class UnknownNameError(ConfigError):
     def __init__(self, kind: str, name: str, valid: Iterable[str], hint: str = "") -> None:
         names = sorted(valid)
         close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.5)
-        shown = names if len(names) <= 12 else [*names[:12], f"... ({len(names)} in all)"]
+        shown = names if len(names) <= _FEW else [*names[:_FEW], f"... ({len(names)} in all)"]
         message = f"unknown {kind} '{name}'"
         if close:
             message += f"; did you mean {' or '.join(close)}?"
-        elif names:
-            message += f"; valid: {', '.join(shown)}."
+        if names and (not close or len(names) <= _FEW):
+            message += f"{'' if close else ';'} valid: {', '.join(shown)}."
         super().__init__(f"{message} {hint}".rstrip())
         self.name, self.valid = name, names
 

@@ -73,6 +73,10 @@ def make_motion(
     """
     if (request.keyframes is None) == (request.poses is None):
         raise ConfigError("a task needs one motion: --keyframes FILE or --poses FILE")
+    if request.origin not in ORIGINS:
+        raise UnknownNameError("origin", request.origin, ORIGINS)
+    if request.keyframes is not None and request.origin != "com":
+        raise ConfigError(f"--origin {request.origin} is for --poses; keyframes are of the com")
     notes: list[str] = []
     if request.keyframes is not None:
         poses, label = _animated(request.keyframes, object_xml, notes), str(request.keyframes)
@@ -115,8 +119,6 @@ def _animated(path: Path, object_xml: Path, notes: list[str]) -> Poses:
 
 def _recorded(request: MotionRequest, model: mujoco.MjModel, body: int, notes: list[str]) -> Poses:
     assert request.poses is not None
-    if request.origin not in ORIGINS:
-        raise UnknownNameError("origin", request.origin, ORIGINS)
     found = pose_file.read(request.poses)
     notes += found.repairs
     if request.origin == "com":

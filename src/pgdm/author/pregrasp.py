@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import torch
 
@@ -27,6 +28,9 @@ SLACK_M, SLACK_RAD = 0.03, 0.2
 """By how much the wrist, carried rigidly with the object, may leave its range: so much the fingers
 and a policy's corrections make up for."""
 _TOUCH_M = 1e-4
+_SLIDES = 3  # of the base's joints, the first ones
+_HAND_M = 0.3  # how much less than the object the wrist may have to go, where that turns
+_CURE = "shorten the motion, or put the object elsewhere (place in the keyframes)"
 _COMPARED = 5  # poses that are tried in the simulation
 
 
@@ -60,6 +64,7 @@ def make_pregrasp(
     """
     if choice == "later":
         return FoundPregrasp(qpos, "none", ["starts from the hand's reset pose: no pre-grasp yet"])
+    _check_travel(scene, poses)
     reach = wrist_beyond(scene, poses)
     if choice.endswith(".npz"):
         found = _from_file(Path(choice), scene, qpos)
@@ -69,13 +74,36 @@ def make_pregrasp(
         poses_found = poses_near(scene, qpos, fingers, reach, progress=told)
         following = [pose for pose in poses_found if reach(pose.qpos) == 0.0]
         found = _firmest(scene, following or poses_found[:1])
-    if (beyond := reach(found.qpos)) > 0.0:
+    if reach(found.qpos) > 0.0:
+        over = _wrist_over(scene, poses)(found.qpos)
+        row, joint = np.unravel_index(int(over.argmax()), over.shape)
         raise ConfigError(
-            f"the wrist cannot follow the motion: carried with the object it would leave its range "
-            f"by {beyond:.2f} (m or rad) more than a policy can make up for; shorten the motion, "
-            "or put the object elsewhere (place in the keyframes)"
+            f"the wrist cannot follow the motion: carried with the object, joint "
+            f"{scene.model.joint(int(joint)).name} would leave its range by {over[row, joint]:.2f} "
+            f"{'m' if joint < _SLIDES else 'rad'} more than a policy can make up for, worst in row "
+            f"{row}; {_CURE}"
         )
     return found
+
+
+def _check_travel(scene: Scene, poses: Poses) -> None:
+    """Check that no base could carry the object that far, before a pose is searched.
+
+    Raises:
+        ConfigError: none could.
+    """
+    mount = np.empty(9)
+    mujoco.mju_quat2Mat(mount, scene.index.mount_quat)
+    travel = np.ptp(poses.pos @ mount.reshape(3, 3), axis=0)
+    low, high = scene.model.jnt_range[:_SLIDES].T
+    far = travel - (high - low + 2 * SLACK_M + _HAND_M)
+    if far.max() > 0:
+        joint = int(far.argmax())
+        raise ConfigError(
+            f"the wrist cannot follow the motion: the object goes {travel[joint]:.2f} m along "
+            f"joint {scene.model.joint(joint).name}, which slides {high[joint] - low[joint]:.2f} "
+            f"m; {_CURE}"
+        )
 
 
 def _firmest(scene: Scene, poses: list[NearPose]) -> FoundPregrasp:
@@ -94,15 +122,21 @@ def _firmest(scene: Scene, poses: list[NearPose]) -> FoundPregrasp:
 
 def wrist_beyond(scene: Scene, poses: Poses) -> Callable[[np.ndarray], float]:
     """Return what tells, for qpos (nq,), by how much the wrist would leave its range, m or rad."""
+    over = _wrist_over(scene, poses)
+    return lambda qpos: float(over(qpos).max().clip(0.0))
+
+
+def _wrist_over(scene: Scene, poses: Poses) -> Callable[[np.ndarray], np.ndarray]:
+    """Return what tells, for qpos (nq,), by how much each base joint is beyond, (T, B) m or rad."""
     reference = ObjectReference(torch.from_numpy(poses.pos), torch.from_numpy(poses.quat))
     low, high = scene.model.jnt_range[: scene.index.num_base_joints].T
-    slack = np.array([SLACK_M] * 3 + [SLACK_RAD] * (len(low) - 3))
+    slack = np.array([SLACK_M] * _SLIDES + [SLACK_RAD] * (len(low) - _SLIDES))
 
-    def beyond(qpos: np.ndarray) -> float:
+    def over(qpos: np.ndarray) -> np.ndarray:
         path = wrist_path(scene.index, reference, torch.from_numpy(qpos)).numpy()
-        return float(np.maximum(low - slack - path, path - high - slack).max().clip(0.0))
+        return np.maximum(low - slack - path, path - high - slack)
 
-    return beyond
+    return over
 
 
 def _from_file(path: Path, scene: Scene, qpos: np.ndarray) -> FoundPregrasp:

@@ -198,8 +198,9 @@ class _Bar:
     def __call__(self, step: str, done: int, total: int) -> None:
         kind = step.split(" ", 1)[0]
         if kind not in self._tasks:
-            self._tasks[kind] = self._bars.add_task(kind, total=total)
-        self._bars.update(self._tasks[kind], completed=done, total=total)
+            self._tasks[kind] = self._bars.add_task(kind, total=total or None)
+        # A bar without a total pulses, and counts the seconds.
+        self._bars.update(self._tasks[kind], completed=done, total=total or None)
 
 
 @contextmanager

@@ -26,8 +26,9 @@ def make_object(
         float | None, typer.Option(help="Known mass, kg; else the density counts.", metavar="KG")
     ] = None,
     density: Annotated[
-        float, typer.Option(help="kg/m3; the benchmark's objects are printed of PLA, 1250.")
-    ] = 1250.0,
+        float | None,
+        typer.Option(help="kg/m3 [1250: the benchmark's objects are printed of PLA].", metavar="D"),
+    ] = None,
     parts: Annotated[
         int | None, typer.Option(help="Convex parts at most, 1 to 64.", metavar="N")
     ] = None,
@@ -43,12 +44,16 @@ def make_object(
 ) -> None:
     """Make an object from a mesh: repaired, checked, taken apart, weighed, dropped, pictured."""
     from pgdm.cli.author_object import print_object
-    from pgdm.library.author_object import ObjectRequest
+    from pgdm.errors import ConfigError
+    from pgdm.library.author_object import DENSITY, ObjectRequest
     from pgdm.library.author_parts import PartsCfg
 
     factor = _factor(scale, unit)
+    if mass is not None and density is not None:
+        raise ConfigError("--mass and --density both say how heavy it is; give one of them")
     cfg = PartsCfg(threshold, parts)
-    print_object(ObjectRequest(mesh, name, factor, mass, density, cfg, licence, replace))
+    made_of = DENSITY if density is None else density
+    print_object(ObjectRequest(mesh, name, factor, mass, made_of, cfg, licence, replace))
 
 
 @app.command("task")

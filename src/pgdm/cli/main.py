@@ -148,7 +148,9 @@ def view(
     from pgdm.cli.view import view_expert, view_reach, view_task
 
     if (ablations or image is not None) and (video is not None or expert or not ablations):
-        raise ConfigError("--ablations and --image FILE go together, without --video or --expert")
+        raise ConfigError(
+            "--ablations and --image FILE go together, without --video, --reach and --expert"
+        )
     if reach and (ablations or expert):
         raise ConfigError("--reach goes without --ablations and --expert")
     if expert and (pregrasp is not None or hand is not None):

@@ -113,9 +113,13 @@ def show(task: str, hand: str | None, offline: bool) -> None:
         depth = own.note.get("depth_mm")
         made_by = str(own.note.get("made_by", "-"))
         table.add_row(source, "you", made_by, "-" if depth is None else f"{depth} mm", plan)
-    Console().print(table)
-    if not table.rows:
-        print(f"{task} has no pre-grasp of hand {name} yet; pgdm pregrasp mocap {task} makes one")
+    if table.rows:
+        Console().print(table)
+        return
+    other = f" --hand {hand}" if hand else ""
+    print(
+        f"{task} has no pre-grasp of hand {name} yet; pgdm pregrasp mocap {task}{other} makes one"
+    )
 
 
 def _steps(start: Start | None) -> str:

@@ -29,6 +29,7 @@ def cut(
     motion = library.motion(cfg.task.motion)
     scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
     found = demonstrations.read(file)
+    count = len(found)
     if demo is not None:
         found = [demonstrations.chosen(found, demo, str(file))]
     with bars() as progress:
@@ -44,7 +45,7 @@ def cut(
     store(path, pregrasp)
     note = pregrasp.note
     print(
-        f"demonstration {note['demonstration']} of {len(found)} read: takes hold at step "
+        f"demonstration {note['demonstration']} (of {count}): takes hold at step "
         f"{note['takes_hold_at']}, cut at step {note['step']}; its object stood "
         f"{note['object_shift_mm']} mm from the task's; slides {note['beyond_range_mm']} mm beyond "
         f"their ranges; palm within {note['palm_error_mm']} mm; penetration {note['depth_mm']} mm"

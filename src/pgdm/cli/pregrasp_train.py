@@ -34,6 +34,10 @@ def train_predictor(hand: str, leave_out: Sequence[str], out: Path | None) -> No
     began = time.monotonic()
     if hand not in available("hand"):
         raise UnknownNameError("hand", hand, available("hand"))
+    known = sorted(open_library().objects())
+    for name in leave_out:
+        if name not in known:  # before anything takes time
+            raise UnknownNameError("object to leave out", name, known)
     with bars() as progress:
         found = collect(hand, progress)
         examples = [one for _, one in found]

@@ -71,8 +71,9 @@ class EnvBuilder:
         notes = []
         if used != self._wanted:
             notes.append(
-                f"pregrasp '{self._wanted}' is not stored for {task} in the "
-                f"{self.scene.asset_source} assets; starting from '{used}'"
+                f"{task} has no start '{self._wanted}' in the assets of "
+                f"{self.scene.asset_source}; starting from '{used}' ('pgdm pregrasp reach {task}' "
+                "plans one)"
             )
         if self.expert is not None and self.expert.approximate:
             notes.append(

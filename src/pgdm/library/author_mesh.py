@@ -176,10 +176,10 @@ def _close(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bo
     if not mesh.is_winding_consistent:
         trimesh.repair.fix_winding(mesh)
         repairs.append("turned faces that were wound against their neighbours")
-    if not mesh.is_watertight:
+    if len(_rims(mesh)):
         _fill(mesh, label, repairs, allow_open)
     before = mesh.faces.copy()
-    trimesh.repair.fix_inversion(mesh, multibody=bool(mesh.is_watertight))
+    trimesh.repair.fix_inversion(mesh, multibody=is_closed(mesh))
     if not np.array_equal(before, mesh.faces):
         repairs.append("turned the surface inside out: it was wound inward")
 
@@ -195,10 +195,26 @@ def _fill(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: boo
             )
         repairs.append(f"left its opening open: a lid would have {share:.0%} of its area")
         return
-    faces = len(mesh.faces)
-    trimesh.repair.fill_holes(mesh)
-    if filled := len(mesh.faces) - faces:
-        repairs.append(f"filled holes with {filled} faces, {share:.1%} of its area")
+    edges = _rims(mesh)
+    hole = _holes(edges, len(mesh.vertices))
+    count = int(hole.max()) + 1
+    rims = [np.unique(edges[hole == one]) for one in range(count)]
+    middles = [mesh.vertices[rim].mean(axis=0) for rim in rims]  # of a fan for each
+    fans = np.column_stack((edges[:, ::-1], len(mesh.vertices) + hole))
+    mesh.vertices = np.concatenate((mesh.vertices, middles))
+    mesh.faces = np.concatenate((mesh.faces, fans))
+    holes = "a hole" if count == 1 else f"{count} holes"
+    repairs.append(f"filled {holes} with {len(fans)} faces, {share:.1%} of its area")
+
+
+def is_closed(mesh: trimesh.Trimesh) -> bool:
+    """Return whether a surface encloses a volume: each edge is passed as often each way.
+
+    So an edge along which two closed pieces touch, which has four faces, opens nothing.
+    """
+    edges, count = mesh.edges.astype(np.int64), len(mesh.vertices)
+    there, back = edges @ [count, 1], edges @ [1, count]
+    return bool(np.array_equal(np.sort(there), np.sort(back)))
 
 
 def opening(mesh: trimesh.Trimesh) -> float:
@@ -206,15 +222,25 @@ def opening(mesh: trimesh.Trimesh) -> float:
 
     A closed line's area vector is half the sum of a x b over its edges, from wherever measured.
     """
-    once = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
-    edges = mesh.edges[once]
+    edges = _rims(mesh)
     if not len(edges):
         return 0.0
     areas = 0.5 * np.cross(mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]])
-    rims = trimesh.graph.connected_component_labels(edges, node_count=len(mesh.vertices))
-    sums = np.zeros((int(rims.max()) + 1, 3))
-    np.add.at(sums, rims[edges[:, 0]], areas)
+    hole = _holes(edges, len(mesh.vertices))
+    sums = np.zeros((int(hole.max()) + 1, 3))
+    np.add.at(sums, hole, areas)
     return float(np.linalg.norm(sums, axis=1).sum())
+
+
+def _rims(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Return the edges (E, 2) that have one face only, in the direction in which it has them."""
+    return mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+
+
+def _holes(edges: np.ndarray, num_vertices: int) -> np.ndarray:
+    """Return which hole each edge (E, 2) of the rims is of, numbered from 0."""
+    label = trimesh.graph.connected_component_labels(edges, node_count=num_vertices)
+    return np.unique(label[edges[:, 0]], return_inverse=True)[1]
 
 
 def _measured(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> SoundMesh:
@@ -228,7 +254,7 @@ def _measured(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open:
         hull = float(mesh.convex_hull.volume)
     except (ValueError, RuntimeError, IndexError) as error:  # Qhull: all points in one plane
         raise CorruptAssetError(f"{label}: is flat, it has no convex hull") from error
-    closed, volume = bool(mesh.is_volume), abs(float(mesh.volume))
+    closed, volume = is_closed(mesh), abs(float(mesh.volume))
     if closed and volume < 1e-4 * hull:
         raise CorruptAssetError(
             f"{label}: encloses {1e6 * volume:.3g} cm3, nothing beside the {1e6 * hull:.3g} cm3 of "

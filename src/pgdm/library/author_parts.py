@@ -19,7 +19,6 @@ from pgdm.library.author_mesh import SoundMesh
 from pgdm.library.report import Progress, silent
 
 _POLL_S = 0.2
-_TYPICAL_S = 30  # what most meshes take; the algorithm does not say how far it is
 _LEAST_SHARE = 1e-5  # of the whole: smaller parts are slivers that MuJoCo refuses
 _MOST_PARTS = 64
 
@@ -65,7 +64,7 @@ def convex_parts(mesh: SoundMesh, cfg: PartsCfg, progress: Progress = silent) ->
     Args:
         mesh: what to take apart.
         cfg: how finely.
-        progress: told the seconds that went by, of the time that most meshes take.
+        progress: told the seconds that went by; the algorithm does not say how far it is.
 
     Raises:
         ConfigError: a setting is out of range.
@@ -143,8 +142,7 @@ def _in_background(
     while not done.done():
         wait([done], _POLL_S)
         waited += _POLL_S
-        seconds = int(waited)
-        progress("convex parts, s", seconds, max(_TYPICAL_S, seconds + 5))
+        progress("convex parts (10 s to some minutes)", int(waited), 0)
     if (error := done.exception()) is not None:
         raise LibraryError(
             f"the mesh could not be taken apart ({type(error).__name__}: {error}); repair it in "

@@ -146,7 +146,7 @@ class TableCheck:
         if depths[row] > SUNK_M:
             raise ConfigError(
                 f"{label}: the object's lowest point is {1e3 * depths[row]:.0f} mm below the table "
-                f"in row {row} ({(depths > SUNK_M).sum()} rows in all); --lift-above-table raises "
+                f"in row {row} ({(depths > SUNK_M).sum()} such rows); --lift-above-table raises "
                 "them"
             )
 

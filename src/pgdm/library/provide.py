@@ -34,9 +34,12 @@ class Spoken:
         now = time.monotonic()
         if step != self._step:
             self._step, self._begun, self._first, self._said = step, now, done, now
-        if now - self._said < self._interval_s or not total:
+        if now - self._said < self._interval_s:
             return
         self._said = now
+        if not total:
+            self._notify(f"{step}: {done} s")
+            return
         rate = (done - self._first) / (now - self._begun)
         left = f", {(total - done) / rate:.0f} s left" if rate > 0 else ""
         self._notify(f"{step}: {done / total:.0%}{left}")

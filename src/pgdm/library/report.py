@@ -10,7 +10,10 @@ class Progress(Protocol):
     """Told how far a long piece of work is."""
 
     def __call__(self, step: str, done: int, total: int) -> None:
-        """Say that ``done`` of ``total`` parts (files or bytes) of ``step`` are done."""
+        """Say that ``done`` of ``total`` parts (files or bytes) of ``step`` are done.
+
+        With a total of 0 nobody knows how much there is, and ``done`` are seconds.
+        """
         ...
 
 

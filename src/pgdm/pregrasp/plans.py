@@ -31,6 +31,11 @@ def pose_of(source: str, motion: Motion, scene: Scene) -> np.ndarray:
     own = pregrasp_file.find(task, hand, source) if source in pregrasp_file.SOURCES else None
     stored = motion.starts.get(source) if own is None else own.pose
     if stored is not None and stored.qpos.shape == (nq,):
+        if stored.is_reset_pose(scene.model.nu):
+            raise ConfigError(
+                f"task '{task}' has no pre-grasp yet, it starts from the hand's reset pose; pose "
+                f"one with 'pgdm pregrasp label {task}', then reach it with --source labeled"
+            )
         return np.array(stored.qpos)
     fitting = [name for name, start in motion.starts.items() if start.qpos.shape == (nq,)]
     have = sorted({*fitting, *pregrasp_file.own(task, hand)})

@@ -37,7 +37,7 @@ def write_sheet(scene: Scene, panels: Sequence[Panel], path: Path) -> Path:
     """
     width, height = PANEL
     rows = -(-len(panels) // COLUMNS)
-    size = COLUMNS * width, rows * (height + _LABEL_HEIGHT)
+    size = min(COLUMNS, len(panels)) * width, rows * (height + _LABEL_HEIGHT)
     sheet = Image.new("RGB", size, _PAPER)
     draw = ImageDraw.Draw(sheet)
     places = _places(scene, panels)

@@ -21,7 +21,7 @@ class Touch:
     """A part of the hand that cuts into something."""
 
     part: str
-    """Finger, or ``palm`` for all else of the hand."""
+    """Finger, ``palm``, or ``forearm``: what the wrist's joints leave behind."""
     body: str
     """What it cuts into."""
     depth_m: float
@@ -71,7 +71,7 @@ class FigureMaker:
         self._joints = names.joints(scene)
         roots = model.body_rootid[model.jnt_bodyid[: model.nu]]
         self._of_hand = np.isin(model.body_rootid, roots)[model.geom_bodyid]
-        self._part = _parts(model, kinematics.fingers)
+        self._part = _parts(model, scene.hand.num_base_joints, kinematics.fingers)
         self._distance = FingertipDistance(scene)
 
     def measure(self, qpos: np.ndarray) -> Figures:
@@ -108,10 +108,12 @@ class FigureMaker:
         return "the floor" if name == "world" else name.partition("/")[0]
 
 
-def _parts(model: mujoco.MjModel, fingers: list[names.Finger]) -> list[str]:
+def _parts(model: mujoco.MjModel, num_base: int, fingers: list[names.Finger]) -> list[str]:
     """Return to which part of the hand each body belongs."""
-    part = [names.PALM] * model.nbody
-    base = {int(model.jnt_bodyid[finger.joints[0]]): finger.name for finger in fingers}
+    wrist = [j for j in range(num_base, min(finger.joints[0] for finger in fingers))]
+    part = [names.FOREARM if wrist else names.PALM] * model.nbody
+    base = {int(model.jnt_bodyid[joint]): names.PALM for joint in wrist}
+    base |= {int(model.jnt_bodyid[finger.joints[0]]): finger.name for finger in fingers}
     for body in range(1, model.nbody):
         inherited = part[model.body_parentid[body]]
         part[body] = base.get(body, inherited)

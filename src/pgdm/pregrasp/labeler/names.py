@@ -11,6 +11,7 @@ import numpy as np
 from pgdm.sim.scene import Scene
 
 PALM = "palm"
+FOREARM = "forearm"
 """Name of all that belongs to no finger."""
 WRIST = "Wrist"
 """Name of the group of the joints that place and turn the hand."""

@@ -85,9 +85,9 @@ class LabelPage:
         return Commands(
             set_joint=self.set_joint,
             preset=lambda name: self.mailbox.post(lambda: self._take(name)),
-            undo=later(lambda: self._change(state.undo)),
-            redo=later(lambda: self._change(state.redo)),
-            reset=later(lambda: self._change(state.reset)),
+            undo=later(lambda: self._went(state.undo, "undone", "nothing to undo")),
+            redo=later(lambda: self._went(state.redo, "done again", "nothing to do again")),
+            reset=later(lambda: self._went(state.reset, "back at the first pose", "")),
             try_it=later(self._try_it),
             cancel=later(self._cancel),
             save=self.save,
@@ -127,6 +127,11 @@ class LabelPage:
         nu = self._scene.model.nu
         self._change(lambda: self.state.set_joints(loaded.qpos[:nu]))
         self.panel.say(". ".join((f"took the {loaded.origin}", *loaded.notes)))
+
+    def _went(self, change: Callable[[], object], done: str, nothing: str) -> None:
+        before = self.state.version
+        self._change(change)
+        self.panel.say(done if self.state.version != before else nothing or done)
 
     def _change(self, change: Callable[[], object], slider: int | None = None) -> None:
         before = self.state.version

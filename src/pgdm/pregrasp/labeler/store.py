@@ -109,7 +109,7 @@ class Poses:
     def _stored(self, name: str) -> Loaded:
         path = pregrasp_file.path_of(self._scene.task.id, self._scene.hand.name, name)
         if path.is_file():
-            return self.read(path, f"your {name} pre-grasp")
+            return self.read(path, f"own {name} pre-grasp")
         if not self._has(name):
             raise ConfigError(
                 f"task '{self._scene.task.id}' has no stored pose '{name}' for hand "
@@ -143,7 +143,7 @@ class Poses:
             worst = self._scene.model.joint(int(beyond.argmax())).name
             notes += (
                 f"{int((beyond > 1e-3).sum())} joints of the {origin} were beyond their limits "
-                f"and are set to them; furthest {worst}, by {beyond.max():.3f}",
+                f"and are set to them; furthest {worst}, by {beyond.max():.3f} m or rad",
             )
         return Loaded(np.concatenate((inside, self._base[self._nu :])), origin, notes)
 

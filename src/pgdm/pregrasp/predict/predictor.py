@@ -99,7 +99,7 @@ def example(scene: Scene, qpos: np.ndarray) -> Example | None:
 
 def object_of(scene: Scene) -> str:
     """Return the library name of a scene's tracked object."""
-    return scene.task.tracked_body.partition("/")[0]
+    return scene.task.objects[0]
 
 
 def fit(
