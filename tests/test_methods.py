@@ -134,6 +134,14 @@ def test_a_dry_run_of_one_run_shows_its_terms(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("library_home")
+def test_a_dry_run_says_which_start_is_missing() -> None:
+    outcome = command("pgdm-run", "task=cup-pour1", "pregrasp=teleop", "--dry-run")
+    assert outcome.code == 2 and "has no stored start 'teleop'" in outcome.errors[0]
+    assert command("pgdm-run", "task=cup-pour1", "pregrasp=mocap", "--dry-run").code == 0  # is made
+    assert command("pgdm-run", "task=cup-pour1", "method=graff", "--dry-run").code == 0  # fetched
+
+
 @pytest.mark.parametrize("pregrasp", ["planned", "mined", "none"])
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_plays_from_every_start(

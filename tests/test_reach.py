@@ -229,6 +229,8 @@ def test_an_episode_can_begin_with_the_reach() -> None:
     assert info["object_error_m"] < 0.05
     with pytest.raises(ConfigError, match="unknown reset option 'raech'; did you mean reach"):
         env.reset(options={"raech": True})
+    with pytest.raises(ConfigError, match="reset option 'reach' is 'no'; valid: True, False"):
+        env.reset(options={"reach": "no"})
 
 
 @pytest.mark.usefixtures("library_home")

@@ -74,9 +74,29 @@ def assets(cfg: ExperimentCfg, notify: Notify, progress: FetchProgress | None = 
     if recipe(cfg.method).needs_expert:
         with suppress(UnknownNameError):  # `env_builder` says which tasks have an expert
             library = ensure_expert(cfg.task.motion, cfg.offline, notify, progress=progress)
-    wanted = Wanted(cfg.task, cfg.hand, own_hand(cfg, library), cfg.sim, cfg.pregrasp.source)
-    ensure_start(library, wanted, cfg.offline, notify, progress or Spoken(notify), threads(cfg))
+    start = wanted_start(cfg, library)
+    ensure_start(library, start, cfg.offline, notify, progress or Spoken(notify), threads(cfg))
     return library
+
+
+def wanted_start(cfg: ExperimentCfg, library: Library) -> Wanted:
+    """Return which start an experiment wants."""
+    return Wanted(cfg.task, cfg.hand, own_hand(cfg, library), cfg.sim, cfg.pregrasp.source)
+
+
+def check_startable(cfg: ExperimentCfg, library: Library) -> None:
+    """Check that an experiment has its start and its expert, as far as nothing is to be made first.
+
+    Raises:
+        ConfigError: if one is missing, and would not be fetched or made.
+    """
+    if cfg.task.motion not in library.tasks():
+        return
+    if recipe(cfg.method).needs_expert and cfg.task.motion not in library.experts().experts:
+        return
+    start = wanted_start(cfg, library)
+    if start.path.is_file() or not start.can_be_made:
+        env_builder(cfg, library)
 
 
 def threads(cfg: ExperimentCfg) -> int:

@@ -45,6 +45,8 @@ def _main(flags: Flags, command: str, debug: bool) -> int:
     from pgdm.cli.plan import run_planned
     from pgdm.cli.train import show, train
     from pgdm.config.store import from_dict_config
+    from pgdm.experiment import check_startable
+    from pgdm.library import open_library
 
     set_up_logging(debug)
     if composed.is_sweep:
@@ -52,6 +54,7 @@ def _main(flags: Flags, command: str, debug: bool) -> int:
     cfg = from_dict_config(composed.jobs[0][1])
     if "--dry-run" in flags.ours:
         show(cfg)
+        check_startable(cfg, open_library())
         return 0
     return train(cfg)
 

@@ -10,7 +10,7 @@ import torch
 from gymnasium import spaces
 
 from pgdm.envs.batch_env import BatchEnv
-from pgdm.errors import UnknownNameError
+from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.sim.batch import Data, Model
 from pgdm.sim.render import Renderer
 
@@ -66,6 +66,8 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         asked = options or {}
         if wrong := sorted(set(asked) - {"reach"}):
             raise UnknownNameError("reset option", wrong[0], ["reach"])
+        if not isinstance(asked.get("reach", False), bool):
+            raise ConfigError(f"reset option 'reach' is {asked['reach']!r}; valid: True, False")
         if seed is not None:
             self._batch.reseed(seed)
         obs = self._batch.reach() if asked.get("reach") else self._batch.reset()

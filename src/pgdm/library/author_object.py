@@ -23,6 +23,7 @@ DENSITY = 1250.0
 
 _DENSITIES = (10.0, 20_000.0)  # foam to gold, kg/m3
 _UPRIGHT_RAD = 0.1
+_RGBA = "0.16 0.45 0.65 1"  # blue: the hands and the library's objects are brown and black
 _MASSES = (0.001, 10.0)  # kg; the benchmark's hands hold 2 kg at most
 
 
@@ -188,7 +189,8 @@ def _write(
     element = mjcf.add(mjcf.add(root, "worldbody"), "body", name="object", pos=place)
     mjcf.add(element, "inertial", **_inertial(body))
     mjcf.object_joints(element)
-    mjcf.add(element, "geom", name=f"{name}_visual", mesh=name, class_="object_visual")
+    look = {"mesh": name, "class_": "object_visual", "rgba": _RGBA}
+    mjcf.add(element, "geom", name=f"{name}_visual", **look)
     for i in range(len(parts)):
         title = f"contact{i}"
         mjcf.add(element, "geom", name=f"{name}_{title}", mesh=title, class_="object_contact")

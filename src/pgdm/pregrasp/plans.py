@@ -79,7 +79,7 @@ def store(
     name = "planned" if source == "mined" else source
     own = None if source == "mined" else pregrasp_file.find(task, hand, source)
     if own is None:
-        own = Pregrasp(Start(target, np.zeros(scene.model.nv), None), None, {"source": source})
+        own = Pregrasp(Start(target, np.zeros(scene.model.nv), None), None, {"made_by": "reach plan", "source": source})
     path = pregrasp_file.path_of(task, hand, name)
     whole = {**own.note, **(note or {}), "reach": figures(plan)}
     pregrasp_file.write(path, replace(own, reached=plan.state, note=whole))

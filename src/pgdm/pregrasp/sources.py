@@ -15,7 +15,15 @@ SOURCES = ("planned", "mined", "mocap", "teleop", "labeled", "learned", "none")
 LIMIT_TOLERANCE = 0.5
 """By how much, m or rad, a joint of the user's own start may be beyond its limits: recordings do
 not stop at them, and published pre-grasps leave theirs by up to 0.46 rad."""
-_LEARNING = "; 'learned' is made by itself after 'pgdm pregrasp train --hand {hand}'"
+_CURES = {
+    "planned": "Stored plans come with a TCDM checkout (pgdm assets import PATH); 'pgdm pregrasp "
+    "reach {0}' makes one",
+    "mined": "'pgdm pregrasp --help' lists how to make others",
+    "mocap": "'pgdm pregrasp mocap {0} --hand {1}' makes one",
+    "teleop": "'pgdm pregrasp teleop {0} FILE' cuts one from a demonstration",
+    "labeled": "'pgdm pregrasp label {0} --hand {1}' opens a page to pose one",
+    "learned": "It is made by itself after 'pgdm pregrasp train --hand {1}'",
+}
 
 
 @dataclass(frozen=True)
@@ -71,11 +79,8 @@ def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
     task, hand = scene.task.id, scene.hand.name
     have = [*motion.starts, *pregrasp_file.own(task, hand)]
     raise ConfigError(
-        f"task '{task}' has no stored start '{cfg.source}' in source '{motion.source}'; "
-        f"it has: {', '.join(sorted(set(have)))} (pregrasp=...). Stored plans come with a "
-        f"TCDM checkout: pgdm assets import PATH; 'pgdm pregrasp --help' lists how to make your own"
-        + _LEARNING.format(hand=hand)
-        * (cfg.source == "learned")
+        f"task '{task}' has no stored start '{cfg.source}' for hand '{hand}'; it has: "
+        f"{', '.join(sorted(set(have)))} (pregrasp=...). {_CURES[cfg.source].format(task, hand)}"
     )
 
 
