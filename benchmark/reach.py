@@ -77,7 +77,12 @@ def update(task: str, seed: int) -> None:
     began = time.process_time()
     plan = plan_reach(scene, target, motion.substeps, seed=seed)
     cpu_s = time.process_time() - began
-    row["ours"][str(seed)] = {**figures(plan), "cpu_s": cpu_s, "failures": plan.failures}
+    row["ours"][str(seed)] = {
+        **figures(plan),
+        "seconds": round(plan.seconds, 1),
+        "cpu_s": cpu_s,
+        "failures": plan.failures,
+    }
     if (stored := published(motion, scene)) is not None and stored.actions is not None:
         theirs = measure(scene, stored.actions, target, motion.substeps)
         row["released"] = {**figures(theirs), "failures": theirs.failures}
@@ -169,13 +174,13 @@ def summary(rows: list[Row]) -> list[str]:
     ours = [one for row in rows for one in row["ours"].values()]
     theirs = [row["released"] for row in rows if "released" in row]
     seeds = max(len(row["ours"]) for row in rows)
-    heads = ["plans", "number", "reached", *(head for head, *_ in COLUMNS.values()), "CPU time [s]"]
+    heads = ["plans", "number", "reached", *(head for head, *_ in COLUMNS.values()), "time [s]"]
     lines = table_head(heads)
     for name, some in ((f"ours, {seeds} seed{'s' * (seeds > 1)}", ours), ("released", theirs)):
         cells = [name, str(len(some)), str(sum(one["reached"] for one in some))]
         for key, (_, factor, _, form) in COLUMNS.items():
             cells.append(spread([factor * one[key] for one in some], form))
-        cells.append(spread([one["cpu_s"] for one in some if "cpu_s" in one], ".0f"))
+        cells.append(spread([one["seconds"] for one in some if "cpu_s" in one], ".0f"))
         lines.append(row_of(cells))
     return lines
 
@@ -189,7 +194,13 @@ def spread(values: list[float], form: str) -> str:
 
 def per_task(rows: list[Row]) -> list[str]:
     """Return every task's figures: ours of the first seed, then the released plan's."""
-    heads = ["task", *(head for head, *_ in COLUMNS.values()), "target beyond limits", "rounds"]
+    heads = [
+        "task",
+        *(head for head, *_ in COLUMNS.values()),
+        "target beyond limits",
+        "rounds",
+        "s",
+    ]
     lines = table_head(heads)
     for row in rows:
         ours, theirs = next(iter(row["ours"].values())), row.get("released")
@@ -199,7 +210,7 @@ def per_task(rows: list[Row]) -> list[str]:
             both = [factor * one[key] for one in (ours, theirs) if one is not None]
             cells.append(" / ".join(bold_above(value, limit, form) for value in both))
         beyond = f"{1e3 * ours['beyond_m']:.0f} mm, {ours['beyond_rad']:.2f} rad"
-        lines.append(row_of([*cells, beyond, str(ours["rounds"])]))
+        lines.append(row_of([*cells, beyond, str(ours["rounds"]), f"{ours['seconds']:.0f}"]))
     return lines
 
 
@@ -221,7 +232,8 @@ def quality_summary(rows: list[Row]) -> list[str]:
         cells = [title, str(len(some)), str(sum(one["free"] for one in some)), f"{deepest:.1f}"]
         cells.append(f"{1e3 * mean(one['fingertip_distance_m'] for one in some):.0f}")
         cells.append(f"{mean(math.degrees(one['palm_angle_rad']) for one in some):.0f}")
-        cells += [f"{mean(iter(lifts)):.0%}", f"{sum(lift > 0 for lift in lifts)} of {len(lifts)}"]
+        cells += [f"{mean(iter(lifts)):.0%}" if lifts else "no lift"]
+        cells += [f"{sum(lift > 0 for lift in lifts)} of {len(lifts)}"]
         lines.append(row_of(cells))
     return lines
 

@@ -79,7 +79,8 @@ def store(
     name = "planned" if source == "mined" else source
     own = None if source == "mined" else pregrasp_file.find(task, hand, source)
     if own is None:
-        own = Pregrasp(Start(target, np.zeros(scene.model.nv), None), None, {"made_by": "reach plan", "source": source})
+        pose = Start(target, np.zeros(scene.model.nv), None)
+        own = Pregrasp(pose, None, {"made_by": "reach plan", "source": source})
     path = pregrasp_file.path_of(task, hand, name)
     whole = {**own.note, **(note or {}), "reach": figures(plan)}
     pregrasp_file.write(path, replace(own, reached=plan.state, note=whole))
@@ -87,7 +88,7 @@ def store(
 
 
 def figures(plan: ReachPlan) -> Mapping[str, Any]:
-    """Return a plan's figures as plain JSON."""
+    """Return a plan's figures as plain JSON; not its time, so that equal plans give equal files."""
     return {
         "reached": plan.reached,
         "steps": len(plan.actions),
@@ -101,5 +102,4 @@ def figures(plan: ReachPlan) -> Mapping[str, Any]:
         "beyond_m": plan.beyond_m,
         "beyond_rad": plan.beyond_rad,
         "rounds": plan.rounds,
-        "seconds": round(plan.seconds, 1),
     }
