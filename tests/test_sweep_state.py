@@ -116,6 +116,8 @@ def test_a_sweep_as_a_whole() -> None:
     assert summary.left_s == pytest.approx(100 / 3)
     assert summarize(found, 1).left_s == pytest.approx(50)
     assert summarize([row("finished", 100)], 1).left_s == 0
+    over = row("running", 150, 4.0)  # of 100: the last iteration is a whole one
+    assert summarize([over], 1).left_s == 0
     assert summarize([row("waiting", 0)], 1).left_s is None
     assert summary_line("x", summarize(found, 1)) == (
         "x: 1 waiting, 1 running, 1 finished, 1 failed; 157 of 400 frames, about 50 s left"

@@ -96,14 +96,11 @@ def collect(hand: str, progress: Progress) -> list[tuple[Scene, Example]]:
         if not poses:
             continue
         scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
-        for start in poses:
-            if start.is_reset_pose(scene.model.nu):
-                continue
-            one = example(scene, start.qpos)
-            if one is None:
-                notify(f"{task}: left out, its object hangs on something")
-            else:
-                found.append((scene, one))
+        if not scene.lies_free:
+            notify(f"{task}: left out, its object hangs on something")
+            continue
+        shown = [start.qpos for start in poses if not start.is_reset_pose(scene.model.nu)]
+        found += [(scene, one) for qpos in shown if (one := example(scene, qpos)) is not None]
     progress("scenes", len(tasks), len(tasks))
     if not found:
         raise LibraryError(f"the library has no pre-grasp of hand '{hand}'. {CURE}")

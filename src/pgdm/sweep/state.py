@@ -147,7 +147,8 @@ def summarize(found: Sequence[Row], slots: int) -> Summary:
     """
     counted = Counter(row.state for row in found)
     rates = [row.frames_per_s for row in found if row.frames_per_s]
-    remaining = [row.total_frames - row.frames for row in found if row.state in _LEFT]
+    # A whole number of iterations may be more than what was asked for.
+    remaining = [max(row.total_frames - row.frames, 0) for row in found if row.state in _LEFT]
     left_s = 0.0 if not remaining else None
     if remaining and rates:
         rate = sum(rates) / len(rates)
