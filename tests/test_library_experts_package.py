@@ -236,7 +236,7 @@ def test_the_command_line_tells_and_shows(
     expert_home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["assets", "verify"]) == 0
-    assert "checkout and 36 expert hand trajectories are sound" in capsys.readouterr().out
+    assert "checkout, animated and 36 expert hand trajectories are sound" in capsys.readouterr().out
     assert main(["assets", "list"]) == 0
     rows = {line.split()[0]: line.split()[-1] for line in capsys.readouterr().out.splitlines()}
     assert (rows["hammer-use1"], rows["piggybank-use1"], rows["dhand-cup"]) == ("yes", "-", "-")
