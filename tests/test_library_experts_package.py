@@ -245,7 +245,7 @@ def test_the_command_line_tells_and_shows(
     assert main(["view", "door-open", "--expert"]) != 0
     assert "Only motion-capture tasks have one" in capsys.readouterr().err
     assert main(["view", "cup-pour1", "--expert", "--pregrasp", "mined"]) != 0
-    assert "leave --pregrasp out" in capsys.readouterr().err
+    assert "leave --pregrasp and --hand out" in capsys.readouterr().err
     code = main(["view", "eyeglasses-pass1", "--expert", "--offline", "--video", "out/a.mp4"])
     captured = capsys.readouterr()
     if "no OpenGL" in captured.err:
