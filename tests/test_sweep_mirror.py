@@ -119,6 +119,19 @@ def test_a_killed_job_gets_its_true_status(
     assert runs(whole.folder)["s0"] == (shown, "study")
 
 
+def test_a_job_that_was_killed_before_mlflow_heard_of_it_is_shown(whole: Plan) -> None:
+    mirror = SweepMirror.of(whole, tell)
+    mirror.open(whole)
+    folder = make(whole.folder / "runs" / "s0", tracking={"experiment": "other"})
+    train(folder)
+    end(folder)
+    mirror.correct(folder.path)  # not adopted: a job without MLflow
+    assert runs(whole.folder) == {"study": ("RUNNING", None)}
+    mirror.adopt(whole.jobs[0])
+    mirror.correct(folder.path)
+    assert runs(whole.folder) == {"study": ("RUNNING", None), "s0": ("FINISHED", "study")}
+
+
 def test_status_tells_mlflow_that_a_sweep_was_killed(whole: Plan, tmp_path: Path) -> None:
     SweepMirror.of(whole, tell).open(whole)
     ledger = Ledger(whole.folder)

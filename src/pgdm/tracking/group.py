@@ -53,16 +53,16 @@ class Group:
         write_json(run_dir / LINK, {**read_json(run_dir / LINK), PARENT: parent})
 
     def correct(self, run_dir: Path) -> None:
-        """Give a run that was killed the status that its folder tells."""
+        """Give a run that was killed the status that its folder tells, if it is of this group."""
         folder = RunFolder(run_dir)
         run_id, status = folder.link.get("run_id"), folder.status()
-        if not isinstance(run_id, str) or status == "running":
+        if not folder.parent() or status == "running":
             return
         with _told(self.uri):
             store = Store.open(self.uri, self._experiment)
-            if status == "finished":  # killed after its end: nobody else tells the rest
+            if status == "finished":  # nobody else tells the rest, or even that it was there
                 sync_run(store, folder)
-            elif store.client.get_run(run_id).info.status == STATUS["running"]:
+            elif run_id and store.client.get_run(run_id).info.status == STATUS["running"]:
                 ended_ms = int(1000 * folder.modified())
                 store.client.set_terminated(run_id, STATUS[status], ended_ms)
 
