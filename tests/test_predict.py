@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from command_line import command
+from command_line import TINY, command
 from pgdm.config.store import compose
 from pgdm.errors import ConfigError, CorruptAssetError, SceneError
 from pgdm.library import Motion, open_library, pregrasp_file
@@ -293,7 +293,7 @@ def test_from_training_to_a_stored_pregrasp(library_home: Path, tmp_path: Path) 
     np.testing.assert_array_equal(stored.pose.qpos, other.pose.qpos)
     # A run makes its start itself, now that a predictor is there.
     path = pregrasp_file.path_of("dmanus-coffeecan", "dmanus", "learned")
-    run = ("task=dmanus-coffeecan", "pregrasp=learned", "total_frames=2048", "eval.video=false")
+    run = ("task=dmanus-coffeecan", "pregrasp=learned", "--offline", *TINY)
     ended = command("pgdm-run", *run, f"run_dir={tmp_path / 'run'}")
     assert ended.code == 0, ended.err
     assert "making it once by a prediction and a reach plan" in ended.err
