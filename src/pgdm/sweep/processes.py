@@ -8,7 +8,7 @@ import socket
 from dataclasses import dataclass
 from pathlib import Path
 
-_STATE, _STARTED = 0, 19  # places in /proc/PID/stat, counted behind the command's name
+_STATE, _THREADS, _STARTED = 0, 17, 19  # places in /proc/PID/stat behind the name
 _DEAD = "ZX"
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
@@ -55,4 +55,6 @@ def _born(pid: int) -> str:
         boot = _BOOT.read_text()[:8]
     except OSError:
         return ""
-    return "" if fields[_STATE] in _DEAD else f"{boot}-{fields[_STARTED]}"
+    # A killed one's first thread may look dead while others still hold its files and locks.
+    gone = fields[_STATE] in _DEAD and int(fields[_THREADS]) <= 1
+    return "" if gone else f"{boot}-{fields[_STARTED]}"
