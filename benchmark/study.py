@@ -102,6 +102,24 @@ def store(found: RunFolder, target: Path) -> None:
         )
 
 
+def table() -> str:
+    """Return success and lifted of every stored run, sampled actions, as a Markdown table."""
+    lines = [f"| setting | {' | '.join(TASKS)} |", "|---" + "|--:" * len(TASKS) + "|"]
+    for setting, (tasks, _) in SETTINGS.items():
+        cells = []
+        for task in TASKS:
+            file = place(setting, task) / RESULT
+            if not file.exists():
+                cells.append("not run" if task in tasks else "no expert")
+                continue
+            metrics = json.loads(file.read_text())["metrics"]
+            lifted = metrics.get("eval_sampled/lifted")  # a door is not lifted
+            shown = "-" if lifted is None else f"{lifted:.0%}"
+            cells.append(f"{metrics['eval_sampled/success']:.1%} / {shown}")
+        lines.append(f"| `{setting}` | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, store, report."""
     parser = argparse.ArgumentParser(
@@ -113,8 +131,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     codes = [] if options.collect else [run(s, options.runs) for s in options.settings]
     stored = len(list((RESULTS / "runs").glob(f"*/*/{RESULT}")))
-    print(f"{stored} of {sum(len(tasks) for tasks, _ in SETTINGS.values())} runs are stored")
+    told = f"{stored} of {sum(len(tasks) for tasks, _ in SETTINGS.values())} runs are stored"
+    print(told)
     if stored:
+        (RESULTS / "README.md").write_text(
+            f"# {told}\n\n`python benchmark/study.py`: one seed, {FRAMES:,} frames (the paper: "
+            "50,000,000), actions sampled; success / lifted. Page, pictures and tables are in "
+            f"`report`.\n\n{table()}"
+        )
         pgdm = str(Path(sys.executable).with_name("pgdm"))
         # From there, as the page names the folders that it was given.
         command = [pgdm, "report", "runs", "--out", "report"]
