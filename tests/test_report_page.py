@@ -159,6 +159,44 @@ def test_ablations_stand_beside_the_papers(tmp_path: Path) -> None:
     ]
 
 
+def test_rows_of_one_name_stand_in_groups_of_their_own(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    for number, action in enumerate(("absolute", "residual")):
+        own = "task=cup-pour1", f"action={action}"
+        make(root / f"{action}-plain", 0.3 + number / 2, *own)
+        make(root / f"{action}-open", 0.1 + number / 2, *own, "ablation=open_hand")
+        make(root / f"{action}-none", 0.2 + number / 2, *own, "pregrasp=none")
+    ramp = "method.curriculum.ramp_frames=40"
+    make(root / "ramp", 0.4, "task=cup-pour1", "action=residual", "method=curriculum", ramp)
+    page = report(root)
+    tables = page[page.index('id="ablation"') : page.index('id="tasks"')]
+    groups = [
+        (heading, re.findall(r"<tr><th>(.+?) †</th>", rest))
+        for heading, rest in re.findall(r"<h3>(.+?)</h3>(.*?)</table>", tables, re.DOTALL)
+    ]
+    pair = ["pgdm with pre-grasp", "pgdm without pre-grasp"]
+    assert groups == [
+        ("no further change", ["none", "open_hand"]),
+        ("action=residual", ["none", "open_hand"]),
+        ("no further change", pair),
+        ("action=residual", [*pair, "curriculum with pre-grasp, ramp_frames=40"]),
+    ]
+
+
+def test_the_overview_has_settings_as_rows_if_they_are_more_than_tasks(tmp_path: Path) -> None:
+    make(tmp_path / "runs" / "a", 0.7, "task=cup-pour1")
+    make(tmp_path / "runs" / "b", 0.2, "task=door-open")
+    assert "setting cup-pour1 door-open" not in text_of(report(tmp_path / "runs"))
+    for source in ("mined", "none"):
+        make(tmp_path / "runs" / source, 0.1, "task=cup-pour1", f"pregrasp={source}")
+    text = text_of(report(tmp_path / "runs"))
+    assert (
+        "setting cup-pour1 door-open pgdm&nbsp;† 70.0% 20.0% pgdm, pregrasp=mined&nbsp;† 10.0%"
+        in text
+    )
+    assert "paper 83.1% 92.2% doing nothing 0.0% 0.0%" in text
+
+
 def test_the_papers_own_runs_are_comparable(tmp_path: Path) -> None:
     make(tmp_path / "runs" / "a", 0.7, "task=cup-pour1", "total_frames=50_000_000")
     text = text_of(report(tmp_path / "runs"))

@@ -62,9 +62,7 @@ def profiles(results: Results, found: dict[Setting, list[Estimate]]) -> Figure:
 
 def bars(results: Results, rows: Sequence[Average]) -> Figure:
     """Draw success of methods with (full) and without (pale) pre-grasps."""
-    names = [row.name for row in rows]
-    double = {name for name in names if names.count(name) > 1}
-    figure, axes = _rows([results.labels[r.setting] if r.name in double else r.name for r in rows])
+    figure, axes = _rows([", ".join(filter(None, (row.name, row.group))) for row in rows])
     for number, row in enumerate(rows):
         value, low, high = row.success
         alpha = 1.0 if row.setting.with_pregrasp else 0.45

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -52,9 +53,10 @@ class Setting:
         """Whether episodes start at a pre-grasp."""
         return self.option("pregrasp") != "none"
 
-    def rest(self, *groups: str) -> tuple[int, tuple[str, ...]]:
-        """Return what is left of it when the options of some groups are put aside."""
-        return self.total_frames, tuple(c for c in self.changes if c.split("=")[0] not in groups)
+    def rest(self, *groups: str) -> tuple[str, ...]:
+        """Return its changes and its length, without what belongs to some config groups."""
+        changes = (c for c in self.changes if re.split("[.=]", c)[0] not in groups)
+        return *changes, f"{self.total_frames:,} frames"
 
     def deviations(self, *groups: str) -> list[str]:
         """Return why its results cannot be set against the paper's; empty if they can.
@@ -62,9 +64,9 @@ class Setting:
         Args:
             groups: those in which the paper's own table differs in the same way.
         """
-        frames, changes = self.rest(*groups)
+        frames = self.total_frames
         fewer = [f"{frames:,} of {PAPER_FRAMES:,} frames"] if frames < PAPER_FRAMES else []
-        return [*fewer, *changes]
+        return [*fewer, *(c for c in self.changes if c.split("=")[0] not in groups)]
 
 
 def setting_of(config: Mapping[str, Any]) -> Setting:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -62,6 +62,8 @@ class Average:
     setting: Setting
     name: str
     """Row of the table: source of pre-grasps, ablation, or method."""
+    group: str
+    """What its setting differs in besides; only rows of one group compare. Empty: all do."""
     tasks: int
     runs: int
     success: Estimate
@@ -115,7 +117,8 @@ def by_source(results: Results) -> list[Average]:
         plain = setting.method == "pgdm" and setting.option("ablation") == "none"
         if plain and setting.with_pregrasp:
             for source, figures in paper()["by_source"].items():
-                rows += _average(results, "source", setting, source, figures, _from(source))
+                group = results.labels[setting] if len(results.settings) > 1 else ""
+                rows += _average(results, "source", setting, source, group, figures, _from(source))
     return rows
 
 
@@ -123,12 +126,15 @@ def by_ablation(results: Results) -> list[Average]:
     """Return the ablations on tcdm30, and what each would be without; empty if there are none."""
     ablated = [s for s in results.settings if s.option("ablation") != "none"]
     rests = {setting.rest("ablation") for setting in ablated}
+    shown = [setting for setting in results.settings if setting.rest("ablation") in rests]
+    groups = _groups(shown, "ablation")
     rows = []
-    for setting in results.settings:
-        if setting.rest("ablation") in rests:
-            name = setting.option("ablation")
-            figures = paper()["by_ablation"].get(name, {})
-            rows += _average(results, "ablation", setting, name, figures, _in_tcdm30, "ablation")
+    for setting in shown:
+        name = setting.option("ablation")
+        figures = paper()["by_ablation"].get(name, {})
+        name += _values(setting, "ablation")
+        args = results, "ablation", setting, name, groups[setting], figures, _in_tcdm30
+        rows += _average(*args, "ablation")
     return rows
 
 
@@ -137,15 +143,16 @@ def baselines(results: Results) -> list[Average]:
     settings = [s for s in results.settings if s.option("ablation") == "none"]
     if len({(s.method, s.with_pregrasp) for s in settings}) < 2:
         return []
+    kinds = {s: ("method",) if s.with_pregrasp else ("method", "pregrasp") for s in settings}
+    groups = _groups(settings, "method", "pregrasp")
     rows = []
-    for setting in settings:
-        figures = paper()["by_ablation"]["none"]
+    for setting, same in kinds.items():
         plain = setting.method == "pgdm" and setting.with_pregrasp
+        figures = paper()["by_ablation"]["none"] if plain else {}
         name = f"{setting.method} {'with' if setting.with_pregrasp else 'without'} pre-grasp"
-        rows += _average(
-            *(results, "baseline", setting, name, figures if plain else {}, _in_tcdm30),
-            *(("method",) if setting.with_pregrasp else ("method", "pregrasp")),
-        )
+        name += _values(setting, "method")
+        args = results, "baseline", setting, name, groups[setting], figures, _in_tcdm30
+        rows += _average(*args, *same)
     return rows
 
 
@@ -173,14 +180,31 @@ def improvements(results: Results) -> dict[tuple[Setting, Setting], tuple[Estima
     return found
 
 
+def _groups(settings: Sequence[Setting], *put_aside: str) -> dict[Setting, str]:
+    """Return what tells settings apart besides some config groups; all empty if nothing does."""
+    rests = {setting: setting.rest(*put_aside) for setting in settings}
+    if len(set(rests.values())) < 2:
+        return dict.fromkeys(settings, "")
+    shared = set.intersection(*map(set, rests.values()))
+    own = {s: ", ".join(c for c in rest if c not in shared) for s, rest in rests.items()}
+    return {setting: text or "no further change" for setting, text in own.items()}
+
+
+def _values(setting: Setting, group: str) -> str:
+    """Return what a setting changes within a config group, as an end of a row's name."""
+    own = [c.split("=", 1) for c in setting.changes if c.startswith(f"{group}.")]
+    return "".join(f", {key.rpartition('.')[2]}={value}" for key, value in own)
+
+
 def _average(
     results: Results,
     table: str,
     setting: Setting,
     name: str,
+    group: str,
     figures: dict[str, float],
     wanted: Callable[[Run], bool],
-    *groups: str,
+    *same: str,
 ) -> Iterator[Average]:
     """Give the row, if any run has finished."""
     scores = results.scores(setting, SUCCESS, wanted)
@@ -196,6 +220,7 @@ def _average(
         table=table,
         setting=setting,
         name=name,
+        group=group,
         tasks=len(scores),
         runs=sum(len(values) for values in scores.values()),
         success=estimate(SUCCESS),
@@ -206,7 +231,7 @@ def _average(
             "com_error": average(known(run, "paper_com_error") for run in first),
         },
         paper=figures,
-        deviations=tuple(results.deviations(setting, *groups)),
+        deviations=tuple(results.deviations(setting, *same)),
     )
 
 
