@@ -21,11 +21,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from pgdm.config.suites import suite
 from pgdm.tracking.run_folder import CONFIG, RESULT, RunFolder, find_runs
 from pgdm.tracking.run_log import FILE_NAME, RunLog, metrics_of
 
 RESULTS = Path(__file__).parent / "results" / "study"
+PICTURE = Path(__file__).parent.parent / "docs" / "images" / "study.png"
 FRAMES = 500_000
 # The curriculum's 4M frames of the paper's 50M, as the same share of these.
 RAMP = f"method.curriculum.ramp_frames={4_000_000 * FRAMES // 50_000_000}"
@@ -59,6 +62,8 @@ SETTINGS = {
     "no_pregrasp-absolute": (TASKS, (ABSOLUTE, "pregrasp=none")),
     "open_hand-absolute": (TASKS, (ABSOLUTE, "ablation=open_hand")),
 }
+
+Rows = dict[str, list[tuple[float, float | None] | str]]
 
 
 def place(setting: str, task: str) -> Path:
@@ -102,22 +107,56 @@ def store(found: RunFolder, target: Path) -> None:
         )
 
 
-def table() -> str:
-    """Return success and lifted of every stored run, sampled actions, as a Markdown table."""
-    lines = [f"| setting | {' | '.join(TASKS)} |", "|---" + "|--:" * len(TASKS) + "|"]
+def figures() -> Rows:
+    """Return of every setting and task success and lifted (a door is not), or why there is none."""
+    found: Rows = {}
     for setting, (tasks, _) in SETTINGS.items():
-        cells = []
+        cells = found.setdefault(setting, [])
         for task in TASKS:
             file = place(setting, task) / RESULT
-            if not file.exists():
+            if file.exists():
+                metrics = json.loads(file.read_text())["metrics"]
+                lifted = metrics.get("eval_sampled/lifted")
+                cells.append((metrics["eval_sampled/success"], lifted))
+            else:
                 cells.append("not run" if task in tasks else "no expert")
-                continue
-            metrics = json.loads(file.read_text())["metrics"]
-            lifted = metrics.get("eval_sampled/lifted")  # a door is not lifted
-            shown = "-" if lifted is None else f"{lifted:.0%}"
-            cells.append(f"{metrics['eval_sampled/success']:.1%} / {shown}")
-        lines.append(f"| `{setting}` | {' | '.join(cells)} |")
+    return found
+
+
+def table(rows: Rows) -> str:
+    """Return them as a Markdown table."""
+    lines = [f"| setting | {' | '.join(TASKS)} |", "|---" + "|--:" * len(TASKS) + "|"]
+    for setting, cells in rows.items():
+        texts = [
+            c if isinstance(c, str) else f"{c[0]:.1%} / {'-' if c[1] is None else f'{c[1]:.0%}'}"
+            for c in cells
+        ]
+        lines.append(f"| `{setting}` | {' | '.join(texts)} |")
     return "\n".join(lines) + "\n"
+
+
+def draw(rows: Rows, file: Path) -> None:
+    """Draw success and lifted side by side, darker where more."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 4.4), layout="constrained")
+    for number, title in enumerate(("success", "lifted")):
+        axes = figure.add_subplot(1, 2, number + 1)
+        values = np.full((len(rows), len(TASKS)), np.nan)
+        for row, cells in enumerate(rows.values()):
+            for column, cell in enumerate(cells):
+                value = None if isinstance(cell, str) else cell[number]
+                values[row, column] = np.nan if value is None else value
+                missing = cell if isinstance(cell, str) else "-"
+                text = missing if value is None else f"{value:.{1 - number}%}"
+                axes.text(column, row, text, ha="center", va="center", fontsize=8)
+        axes.imshow(values, cmap="GnBu", vmin=0.0, vmax=(0.6, 1.3)[number], aspect="auto")
+        axes.set_title(title, fontsize=10)
+        axes.set_xticks(range(len(TASKS)), TASKS, rotation=20, ha="right", fontsize=8)
+        names = list(rows) if not number else [""] * len(rows)
+        axes.set_yticks(range(len(rows)), names, fontsize=9)
+        axes.tick_params(length=0)
+    figure.savefig(file, dpi=100)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -134,11 +173,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     told = f"{stored} of {sum(len(tasks) for tasks, _ in SETTINGS.values())} runs are stored"
     print(told)
     if stored:
+        rows = figures()
         (RESULTS / "README.md").write_text(
             f"# {told}\n\n`python benchmark/study.py`: one seed, {FRAMES:,} frames (the paper: "
             "50,000,000), actions sampled; success / lifted. Page, pictures and tables are in "
-            f"`report`.\n\n{table()}"
+            f"`report`.\n\n{table(rows)}"
         )
+        draw(rows, PICTURE)
         pgdm = str(Path(sys.executable).with_name("pgdm"))
         # From there, as the page names the folders that it was given.
         command = [pgdm, "report", "runs", "--out", "report"]
