@@ -171,7 +171,7 @@ def test_rows_of_one_name_stand_in_groups_of_their_own(tmp_path: Path) -> None:
     page = report(root)
     tables = page[page.index('id="ablation"') : page.index('id="tasks"')]
     groups = [
-        (heading, re.findall(r"<tr><th>(.+?) †</th>", rest))
+        (heading, re.findall(r"<tr><th class=\"head\">(.+?) †</th>", rest))
         for heading, rest in re.findall(r"<h3>(.+?)</h3>(.*?)</table>", tables, re.DOTALL)
     ]
     pair = ["pgdm with pre-grasp", "pgdm without pre-grasp"]
