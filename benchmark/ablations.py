@@ -2,10 +2,10 @@
 
     python benchmark/ablations.py [--csv FILE] [TASK ...]
 
-Needs a library with the tasks' assets; ``pregrasp=planned`` falls back to mined where no plan is
-stored. Prints a summary in Markdown, as on docs/ablations.md, and writes every start as CSV. The
-column ``residual_gap_m`` tells how far the fingertips stay from their places in the pre-grasp, on
-average, if an action of ``action=residual`` corrects the wrist as well as it can.
+Fetches what it can, other tasks need a checkout; ``pregrasp=planned`` falls back to mined where no
+plan is stored. Prints a summary in Markdown, as on docs/ablations.md, and writes every start as
+CSV. The column ``residual_gap_m`` tells how far the fingertips stay from their places in the
+pre-grasp, on average, if an action of ``action=residual`` corrects the wrist as well as it can.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from mujoco.minimize import least_squares
 
 from pgdm.config.groups import available
 from pgdm.config.store import compose
-from pgdm.experiment import env_builder
-from pgdm.library import open_library
+from pgdm.experiment import assets, env_builder
 from pgdm.pregrasp.ablate import ablate
 from pgdm.pregrasp.sources import start_state
 from pgdm.sim.scene import Scene
@@ -40,7 +39,8 @@ RESULTS = Path(__file__).parent / "results" / "ablations.csv"
 def measure(task: str) -> list[dict[str, Any]]:
     """Return a row for each start state and ablation of a task."""
     rows = []
-    builder = env_builder(compose([f"task={task}"]), open_library())
+    whole = compose([f"task={task}"])
+    builder = env_builder(whole, assets(whole, print))
     for pregrasp in STARTS:
         for ablation in available("ablation"):
             # The task does not matter here, so that each choice is composed only once.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import harmonic_mean
@@ -16,7 +15,7 @@ from pgdm.config.saved import check_run_dir, save_config
 from pgdm.config.schema import ExperimentCfg
 from pgdm.envs.build import EnvBuilder, EnvCfg
 from pgdm.envs.film import film_policy
-from pgdm.errors import PgdmError, RenderError, RunError, UnknownNameError
+from pgdm.errors import PgdmError, RenderError, RunError
 from pgdm.library import Library, ensure, ensure_expert
 from pgdm.library.provide import Spoken
 from pgdm.library.report import Progress as FetchProgress
@@ -72,8 +71,7 @@ def assets(cfg: ExperimentCfg, notify: Notify, progress: FetchProgress | None = 
     """
     library = ensure(cfg.task.motion, cfg.offline, notify, progress=progress)
     if recipe(cfg.method).needs_expert:
-        with suppress(UnknownNameError):  # `env_builder` says which tasks have an expert
-            library = ensure_expert(cfg.task.motion, cfg.offline, notify, progress=progress)
+        library = ensure_expert(cfg.task.motion, cfg.offline, notify, progress=progress)
     start = wanted_start(cfg, library)
     ensure_start(library, start, cfg.offline, notify, progress or Spoken(notify), threads(cfg))
     return library

@@ -10,12 +10,9 @@ from pgdm.envs.film import film_expert, film_motion, film_reach
 from pgdm.errors import ConfigError
 from pgdm.experiment import assets, env_builder
 from pgdm.library import ensure_expert
-from pgdm.library.expert_index import ExpertEntry
 from pgdm.pregrasp.rollout import play
 from pgdm.pregrasp.sources import no_plan
 from pgdm.sim.replay import expert_marks, expert_qpos, motion_qpos
-
-_FAR_M = 0.01  # out of its limits by more than this the hand is not where methods have it
 
 
 def view_task(
@@ -74,12 +71,13 @@ def view_expert(task: str, video: Path | None, offline: bool) -> None:
     """
     _check(video)
     # The recorded pose is that of the mesh's origin: only so the fingers lie where they lay.
-    cfg = composed(task, None, "method=graff", "reference=com_corrected")
+    cfg = composed(task, None, "method=graff", "pregrasp=mined", "reference=com_corrected")
     library = ensure_expert(cfg.task.motion, offline, notify)
     builder = env_builder(cfg, library)
     scene, mdp, expert = builder.scene, builder.mdp, builder.expert
     assert expert is not None and mdp.expert is not None  # the method needs one
-    _warn(library.expert_entry(cfg.task.motion), task)
+    for note in builder.notes:
+        notify(note)
     reference = mdp.reference
     # As published, not clipped to the limits: what the person did, not what the robot can do.
     qpos = expert_qpos(scene, mdp.start.qpos, reference, expert.qpos)
@@ -90,16 +88,6 @@ def view_expert(task: str, video: Path | None, offline: bool) -> None:
         show_motion(scene.model, qpos, marks)
         return
     _say(video, film_expert(scene, qpos, marks, reference, video))
-
-
-def _warn(entry: ExpertEntry, task: str) -> None:
-    if entry.approximate:
-        notify(f"the expert hand trajectory of {task} is approximate: rebuilt, not published")
-    if entry.beyond_limits_m > _FAR_M:
-        notify(
-            f"the hand of {task} is shown as recorded: its base leaves the robot's limits by up to "
-            f"{entry.beyond_limits_m:.2f} m; methods compare with joints clipped to them"
-        )
 
 
 def _check(video: Path | None) -> None:

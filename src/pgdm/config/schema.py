@@ -8,9 +8,10 @@ from typing import Annotated
 
 from pgdm.config.strict import ChosenBy, flatten
 from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.library import expert_file, figures
 from pgdm.mdp.actions import KINDS, ActionCfg
 from pgdm.mdp.observations import LAYOUTS, ObsCfg
-from pgdm.methods import MethodCfg, config_class
+from pgdm.methods import MethodCfg, config_class, recipe
 from pgdm.motion.reference import FRAMES, ReferenceCfg
 from pgdm.pregrasp.ablate import AblationCfg
 from pgdm.pregrasp.sources import SOURCES, PregraspCfg
@@ -83,6 +84,7 @@ class ExperimentCfg:
         check_batch(self.algo, self.num_envs)
         self.ablation.check(self.pregrasp.source)
         self._check_hand()
+        self._check_expert()
         self._check_placements()
         if self.device.partition(":")[0] not in ("cpu", "cuda"):
             raise UnknownNameError("device", self.device, ("cpu", "cuda"))
@@ -104,6 +106,26 @@ class ExperimentCfg:
                 f"action.kind=residual carries the wrist on 6 base joints, but "
                 f"hand '{hand.name}' has hand.num_base_joints {hand.num_base_joints}; "
                 f"use action=absolute"
+            )
+
+    def _check_expert(self) -> None:
+        if not recipe(self.method).needs_expert:
+            return
+        compares = f"method={self.method.name} compares with an expert"
+        instead = "Methods that need none: pgdm, curriculum"
+        if self.task.motion not in figures.GRAB_TASKS:
+            raise ConfigError(
+                f"{compares}, and there is none for the motion '{self.task.motion}' of task "
+                f"'{self.task.id}'; motions that have one (suite adroit40): "
+                f"{', '.join(figures.GRAB_TASKS)}. {instead}"
+            )
+        hand = self.hand
+        fingertips = tuple(hand.points[i] for i in hand.fingertips)
+        if (hand.name, fingertips) != (expert_file.HAND, expert_file.FINGERTIPS):
+            raise ConfigError(
+                f"{compares}, whose hand is {expert_file.HAND} with the fingertips "
+                f"{', '.join(expert_file.FINGERTIPS)}; hand '{hand.name}' with "
+                f"{', '.join(fingertips) or 'none'} cannot follow it. {instead}"
             )
 
     def _check_placements(self) -> None:

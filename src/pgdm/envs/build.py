@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from pgdm.envs.batch_env import BatchEnv, Mdp
-from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.errors import UnknownNameError
 from pgdm.library import Expert, Library
 from pgdm.mdp.actions import ActionCfg, action_map
 from pgdm.mdp.observations import ObsCfg, layout
@@ -19,6 +20,9 @@ from pgdm.pregrasp.sources import PregraspCfg, start_state
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.randomize import Randomizer
 from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
+
+_FAR_M = 0.01
+"""Clipped by more than this, an expert's hand is not where the person's was."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class EnvBuilder:
 
     Raises:
         PgdmError: if the library lacks an asset, the scene does not compile, the start state is
-            not stored, or the recipe needs an expert that this task or hand does not have.
+            not stored, or the recipe needs an expert that the task does not have.
     """
 
     def __init__(self, library: Library, cfg: EnvCfg, recipe: Recipe) -> None:
@@ -54,7 +58,7 @@ class EnvBuilder:
             start = self.ablated.start
         index = self.scene.index
         reference = _reference(cfg.reference, ObjectReference.of(self.motion), self.scene)
-        self.expert = _stored_expert(library, cfg) if recipe.needs_expert else None
+        self.expert = library.expert(cfg.task.motion) if recipe.needs_expert else None
         self.mdp = Mdp(
             reference=reference,
             start=start,
@@ -80,7 +84,18 @@ class EnvBuilder:
                 f"the expert hand trajectory of {task} is approximate: it was rebuilt from another "
                 "recording, as the published one is empty"
             )
+        if (beyond := self._expert_beyond_m()) > _FAR_M:
+            notes.append(
+                f"the expert's hand of {task} leaves the robot's limits by up to {beyond:.2f} m; "
+                "methods follow it clipped to them, that far from the object"
+            )
         return notes
+
+    def _expert_beyond_m(self) -> float:
+        """Return by how much the base of the expert's hand leaves its limits at most."""
+        if self.expert is None or self.mdp.expert is None:
+            return 0.0
+        return float(np.abs(self.expert.qpos - self.mdp.expert.joints.numpy())[:, :3].max())
 
     def facts(self) -> dict[str, str]:
         """Return what a result depends on besides its configuration and the program."""
@@ -121,29 +136,6 @@ def _reference(cfg: ReferenceCfg, stored: ObjectReference, scene: Scene) -> Obje
         return stored
     com = scene.model.body_ipos[scene.index.object_body].copy()
     return stored.com_corrected(torch.from_numpy(com))
-
-
-# The hand that the experts' trajectories are joints of.
-_EXPERT_HAND, _EXPERT_FINGERTIPS = "adroit", 5
-
-
-def _stored_expert(library: Library, cfg: EnvCfg) -> Expert:
-    hand = cfg.hand
-    if hand.name != _EXPERT_HAND or len(hand.fingertips) != _EXPERT_FINGERTIPS:
-        raise ConfigError(
-            f"this method compares with an expert, whose hand is {_EXPERT_HAND} with "
-            f"{_EXPERT_FINGERTIPS} fingertips; hand '{hand.name}' with {len(hand.fingertips)} "
-            "cannot follow it: use hand=adroit, or method=pgdm or method=curriculum"
-        )
-    try:
-        return library.expert(cfg.task.motion)
-    except UnknownNameError as error:
-        raise ConfigError(
-            f"this method compares with an expert, and there is none for the motion "
-            f"'{cfg.task.motion}' of task '{cfg.task.id}'; tasks that have one: "
-            f"{', '.join(error.valid) or 'those of suite adroit40, once fetched'}. Methods that "
-            "need none: pgdm, curriculum"
-        ) from error
 
 
 def _followed(expert: Expert, scene: Scene) -> ExpertReference:

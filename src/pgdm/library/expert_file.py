@@ -15,8 +15,12 @@ from pgdm.errors import CorruptAssetError
 from pgdm.library import safe_npz
 from pgdm.library.motion_file import numbers
 
+HAND = "adroit"
+"""The robot hand that the joints are of."""
 FINGERS = ("ff", "mf", "lf", "rf", "th")
 """Fingers in the order of every array here: fore, middle, little, ring finger, thumb."""
+FINGERTIPS = tuple(f"{finger}distal_point" for finger in FINGERS)
+"""Their points on that hand."""
 
 JOINTS = 30
 """Joints of Adroit: six of the base, then wrist and fingers."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from pgdm.errors import CorruptAssetError
 from pgdm.library.check import compiled
-from pgdm.library.expert_file import FINGERS, JOINTS
+from pgdm.library.expert_file import FINGERTIPS, JOINTS
 
 
 class ExpertHand:
@@ -25,11 +25,12 @@ class ExpertHand:
     def __init__(self, xml: Path) -> None:
         model = compiled(xml, xml.parent.name)
         names = {model.geom(i).name: i for i in range(model.ngeom)}
-        tips = [f"{finger}distal_point" for finger in FINGERS]
-        if model.nq != JOINTS or not names.keys() >= set(tips):
-            raise CorruptAssetError(f"{xml}: not Adroit with {JOINTS} joints and {', '.join(tips)}")
+        if model.nq != JOINTS or not names.keys() >= set(FINGERTIPS):
+            raise CorruptAssetError(
+                f"{xml}: not Adroit with {JOINTS} joints and {', '.join(FINGERTIPS)}"
+            )
         self._model, self._data = model, mujoco.MjData(model)
-        self._tips = [names[tip] for tip in tips]
+        self._tips = [names[tip] for tip in FINGERTIPS]
         self._slides = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
         mujoco.mj_kinematics(model, self._data)
         self._axes = self._data.xaxis[self._slides].copy()  # (3, 3) the base's, rows, world frame
@@ -51,7 +52,7 @@ class ExpertHand:
 
     def fingertips(self, qpos: np.ndarray) -> np.ndarray:
         """Return the fingertips (T, 5, 3) m, world frame, at joints (T, 30)."""
-        result = np.empty((len(qpos), len(FINGERS), 3))
+        result = np.empty((len(qpos), len(FINGERTIPS), 3))
         for row, joints in zip(result, qpos, strict=True):
             self._data.qpos[:] = joints
             mujoco.mj_kinematics(self._model, self._data)

@@ -50,7 +50,7 @@ class _Builder:
 
     def __init__(self, library: Library, folder: Path) -> None:
         self._library, self._folder = library, folder
-        self._hand = ExpertHand(library.hand_xml("adroit"))
+        self._hand = ExpertHand(library.hand_xml(expert_file.HAND))
         self.experts: dict[str, ExpertEntry] = {}
         self.left_out: dict[str, str] = {}
 

@@ -21,7 +21,7 @@ from pgdm.errors import CorruptAssetError
 from pgdm.library import human_hand, motion_file, myohand, safe_npz, wheel, wheel_experts
 from pgdm.library.catalog import Library
 from pgdm.library.check import compiled
-from pgdm.library.expert_file import HUMAN_JOINTS
+from pgdm.library.expert_file import HAND, HUMAN_JOINTS
 from pgdm.library.human_hand import PalmView, Ridge
 from pgdm.library.limp_hand import LimpHand
 from pgdm.library.motion_file import Motion, numbers
@@ -148,7 +148,7 @@ class Rebuilder:
         source = self._library.source_of(task)
         thing = self._library.object_xml(self._library.entry(task).objects[0], source)
         limp = LimpHand(
-            self._library.scene_xml(source), self._library.hand_xml("adroit", source), thing
+            self._library.scene_xml(source), self._library.hand_xml(HAND, source), thing
         )
         # The published simulation took the motion's positions for those of the centre of mass in
         # upright pose, so that its objects stand that much aside.

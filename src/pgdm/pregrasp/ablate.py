@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import mujoco
 import numpy as np
@@ -19,6 +20,9 @@ FINGER_LENGTH_M = 0.1
 """Turns a finger's error into one of its tip, to weigh it against a retreat of the wrist."""
 OBJECT_TOLERANCE_M = 0.005
 """By how much fingers that move to their pose may displace the object."""
+OVERLAP_M = 0.0015
+"""Deeper than this no ablated start is in anything: hands at rest on an object are, in the
+simulation, where contacts give way. Less deep it may be as far as the stored start is."""
 REACH_TOLERANCE_RAD = 0.2
 """How near moving fingers must come to their pose in the simulation: Adroit's weak servos hang
 0.1 rad behind where tendons couple two joints."""
@@ -99,6 +103,7 @@ class Ablated:
             "ablation_distance_mm": f"{1e3 * self.distance_m:.1f}",
             "ablation_retreat_mm": f"{1e3 * self.retreat_m:.1f}",
             "ablation_finger_error_rad": f"{self.finger_error_rad:.3f}",
+            "ablation_depth_mm": f"{1e3 * self.depth_m:.1f}",
             "ablation_reached_by": "simulation" if self.simulated else "setting",
         }
 
@@ -109,11 +114,11 @@ def ablate(cfg: AblationCfg, start: StartState, scene: Scene, substeps: int) -> 
     The wrist's orientation stays, and so do pose and velocity of the object; the hand stands
     still. The distance is counted along the line on which the base's slides lead to the reset
     pose, straight in the world, and beyond it where that is nearer; the line ends where a slide
-    does. Where the hand would then cut into something deeper than the stored start does, either
-    the wrist goes further, back, up or away from the object, or each finger stops where it meets
-    something on its way from the pre-grasp; whichever deviates less. Stopped fingers are moved
-    there in the simulation with the object free, as a proof that they get there without pushing
-    it. Equal arguments give an equal result.
+    does. Where the hand would then be in something, deeper than the stored start or `OVERLAP_M`,
+    either the wrist goes further, back, up or away from the object, or each finger stops where it
+    meets something on its way from the pre-grasp; whichever deviates less. Stopped fingers are
+    moved there in the simulation with the object free, as a proof that they get there without
+    pushing it. Equal arguments give an equal result.
 
     Args:
         cfg: what to take away.
@@ -122,10 +127,15 @@ def ablate(cfg: AblationCfg, start: StartState, scene: Scene, substeps: int) -> 
         substeps: physics steps per control step.
 
     Raises:
-        ConfigError: if the start is a reset pose, or the hand's mean has another length.
+        ConfigError: if the start is the reset pose, or the hand's mean has another length.
         SceneError: if no free pose is found up to where the slides end.
     """
     cfg.check(start.source)
+    if cfg.changes_start and not start.qpos[: scene.model.nu].any():
+        raise ConfigError(
+            f"ablation={cfg.name} changes the pre-grasp, but the start '{start.source}' of task "
+            f"'{scene.task.id}' is the hand's reset pose: nothing is left to ablate"
+        )
     ablation = _Ablation(cfg, start, scene)
     if not cfg.changes_start:
         return ablation.found(start.qpos, 0.0)
@@ -146,8 +156,9 @@ class _Ablation:
     def __init__(self, cfg: AblationCfg, start: StartState, scene: Scene) -> None:
         self._cfg, self._start, self._scene = cfg, start, scene
         self._contact = HandContact(scene)
-        self._allowed = self._contact.depths(start.qpos)  # m, of each finger and the rest
-        self.starts_inside = float(self._allowed.max()) > OBJECT_TOLERANCE_M
+        depths = self._contact.depths(start.qpos)  # m, of each finger and the rest
+        self._allowed = np.minimum(depths, OVERLAP_M)
+        self.starts_inside = float(depths.max()) > OBJECT_TOLERANCE_M
         """Whether the start cuts into something so far that a simulation would push it away."""
         self._fingers = slice(self._contact.first_finger_joint, scene.model.nu)
         self._goal = self._finger_goal()  # (J,) rad
@@ -192,7 +203,9 @@ class _Ablation:
                     qpos = self._advance(retreat * way)
                     if self._is_free(qpos):
                         poses.append(self.found(qpos, float(retreat)))
-            poses = sorted((p for p in poses if p.deviation_m < limit), key=_deviation)
+            poses = sorted(
+                (p for p in poses if p.deviation_m < limit), key=attrgetter("deviation_m")
+            )
             if poses and poses[0].deviation_m <= retreat + SLOW_STEP_M:
                 break
         return poses
@@ -241,7 +254,6 @@ class _Ablation:
         return self._pose(retreat, fingers)
 
     def _is_free(self, qpos: np.ndarray) -> bool:
-        """Return whether no part of the hand is deeper in anything than in the stored start."""
         return bool((self._contact.depths(qpos) <= self._allowed + _EXACT_M).all())
 
     def _pose(self, retreat: np.ndarray, fingers: np.ndarray) -> np.ndarray:
@@ -283,10 +295,6 @@ class _Ablation:
                 "hand.num_wrist_joints"
             )
         return np.array(hand.mean_fingers_rad).clip(*ranges.T)
-
-
-def _deviation(pose: Ablated) -> float:
-    return pose.deviation_m
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

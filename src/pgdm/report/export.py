@@ -24,7 +24,12 @@ FILES = (
     "curves.csv",
 )
 
-ABLATION = ("ablation_distance_mm", "ablation_retreat_mm", "ablation_finger_error_rad")
+ABLATION = (
+    "ablation_distance_mm",
+    "ablation_retreat_mm",
+    "ablation_finger_error_rad",
+    "ablation_depth_mm",
+)
 """What a run tells of its ablated start; empty without an ablation."""
 
 Aggregates = dict[Setting, tuple[Estimate, list[Estimate], int, int]]
