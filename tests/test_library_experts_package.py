@@ -15,6 +15,8 @@ import pytest
 from conftest import DOWNLOADS, fetched_wheel
 from library_trees import snapshot
 from pgdm.cli.main import main
+from pgdm.config.store import compose
+from pgdm.experiment import env_builder
 from pgdm.library import (
     Library,
     ensure_expert,
@@ -29,6 +31,7 @@ from pgdm.library.check import compiled
 from pgdm.library.expert_contacts import BONE_M, CONTACT_M, bones
 from pgdm.library.report import silent
 from pgdm.library.verify import damaged
+from pgdm.sim.replay import expert_marks, expert_qpos
 
 pytestmark = pytest.mark.slow
 
@@ -232,6 +235,28 @@ def test_a_recording_that_does_not_fit_leaves_out_one_task_only(
     assert "not a recording of it" in index.left_out["hammer-use1"]
 
 
+@pytest.mark.parametrize("task", ["hammer-use1", "eyeglasses-pass1"])
+def test_what_is_played_is_what_was_recorded(task: str, library: Library) -> None:
+    """``pgdm view --expert``: the published hand, unclipped, the object, and where they touch."""
+    cfg = compose([f"task={task}", "method=graff", "pregrasp=mined", "reference=com_corrected"])
+    builder = env_builder(cfg, library)
+    mdp, scene, expert = builder.mdp, builder.scene, library.expert(task)
+    assert mdp.expert is not None
+    frames = expert_qpos(scene, mdp.start.qpos, mdp.reference, expert.qpos)
+    marks = expert_marks(mdp.reference, mdp.expert)
+    file = published(task)
+    skipped = len(file["s"]) - len(frames)
+    np.testing.assert_allclose(frames[:, :30], file["s"][skipped:, :30])
+    data, body = mujoco.MjData(scene.model), scene.index.object_body
+    for t in (0, len(frames) // 2, len(frames) - 1):
+        data.qpos[:] = frames[t]
+        mujoco.mj_kinematics(scene.model, data)
+        np.testing.assert_allclose(data.xpos[body], file["object_translation"][skipped + t])
+        on_object = (marks[t] - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
+        np.testing.assert_allclose(on_object, expert.contacts[t][expert.in_contact[t]], atol=1e-12)
+    assert max(map(len, marks)) >= 4  # most fingers touch at some time
+
+
 def test_the_command_line_tells_and_shows(
     expert_home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -251,5 +276,5 @@ def test_the_command_line_tells_and_shows(
     if "no OpenGL" in captured.err:
         pytest.skip(captured.err)
     assert code == 0, captured.err
-    assert "base leaves the robot's limits by up to 0.14 m" in captured.err
+    assert "hand of eyeglasses-pass1 leaves the robot's limits by up to 0.14 m" in captured.err
     assert (tmp_path / "out" / "a.mp4").read_bytes()[4:8] == b"ftyp"

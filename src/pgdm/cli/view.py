@@ -70,9 +70,9 @@ def view_expert(task: str, video: Path | None, offline: bool) -> None:
             missing, or nothing can be drawn.
     """
     _check(video)
+    library = ensure_expert(composed(task, None).task.motion, offline, notify)
     # The recorded pose is that of the mesh's origin: only so the fingers lie where they lay.
     cfg = composed(task, None, "method=graff", "pregrasp=mined", "reference=com_corrected")
-    library = ensure_expert(cfg.task.motion, offline, notify)
     builder = env_builder(cfg, library)
     scene, mdp, expert = builder.scene, builder.mdp, builder.expert
     assert expert is not None and mdp.expert is not None  # the method needs one
