@@ -39,7 +39,6 @@ TASKS = suite("quick6")
 EXPERTS = [task for task in TASKS if task in suite("adroit_experts")]
 """Tasks whose hand trajectory of an expert is published: DeepMimic and GRAFF* need one."""
 
-RESIDUAL, ABSOLUTE = "action=residual", "action=absolute"
 COMMON = (
     "algo=ppo_fast",
     "seed=0",
@@ -48,20 +47,24 @@ COMMON = (
     "eval.interval_frames=100000",
     "eval.video=false",
 )
-SETTINGS = {
-    "pgdm": (TASKS, (RESIDUAL,)),
-    "no_pregrasp": (TASKS, (RESIDUAL, "pregrasp=none")),
-    "open_hand": (TASKS, (RESIDUAL, "ablation=open_hand")),
-    "mean_hand": (TASKS, (RESIDUAL, "ablation=mean_hand")),
-    "distance_15cm": (TASKS, (RESIDUAL, "ablation=distance_15cm")),
-    "distance_25cm": (TASKS, (RESIDUAL, "ablation=distance_25cm")),
-    "deepmimic": (EXPERTS, (RESIDUAL, "method=deepmimic")),
-    "graff": (EXPERTS, (RESIDUAL, "method=graff")),
-    "curriculum": (TASKS, (RESIDUAL, "method=curriculum", RAMP)),
-    "pgdm-absolute": (TASKS, (ABSOLUTE,)),
-    "no_pregrasp-absolute": (TASKS, (ABSOLUTE, "pregrasp=none")),
-    "open_hand-absolute": (TASKS, (ABSOLUTE, "ablation=open_hand")),
+_CHANGES = {
+    "pgdm": (TASKS, ()),
+    "no_pregrasp": (TASKS, ("pregrasp=none",)),
+    "open_hand": (TASKS, ("ablation=open_hand",)),
+    "mean_hand": (TASKS, ("ablation=mean_hand",)),
+    "distance_15cm": (TASKS, ("ablation=distance_15cm",)),
+    "distance_25cm": (TASKS, ("ablation=distance_25cm",)),
+    "deepmimic": (EXPERTS, ("method=deepmimic",)),
+    "graff": (EXPERTS, ("method=graff",)),
+    "curriculum": (TASKS, ("method=curriculum", RAMP)),
 }
+_ALSO_ABSOLUTE = ("pgdm", "no_pregrasp", "open_hand")
+SETTINGS = {
+    f"{name}-{action}": (_CHANGES[name][0], (f"action={action}", *_CHANGES[name][1]))
+    for action, names in (("residual", _CHANGES), ("absolute", _ALSO_ABSOLUTE))
+    for name in names
+}
+"""Tasks and overrides of each sweep; ``absolute`` are the paper's actions."""
 
 Rows = dict[str, list[tuple[float, float | None] | str]]
 

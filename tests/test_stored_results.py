@@ -1,0 +1,43 @@
+"""What benchmark/results says of the studies is what their stored runs say."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pgdm.config.store import compose
+
+BENCHMARK = Path(__file__).resolve().parents[1] / "benchmark"
+
+sys.path.insert(0, str(BENCHMARK))
+import methods  # noqa: E402 (benchmark/ is no package: each file is a program)
+import study  # noqa: E402
+
+
+@pytest.mark.parametrize("setting", study.SETTINGS)
+def test_stored_runs_of_the_study_are_what_their_folder_says(setting: str) -> None:
+    tasks, overrides = study.SETTINGS[setting]
+    for task in tasks:
+        folder = study.place(setting, task)
+        stored = yaml.safe_load((folder / "config.yaml").read_text())
+        wanted = dataclasses.asdict(compose([f"task={task}", *study.COMMON, *overrides]))
+        assert stored["run_dir"] == f"runs/{setting}/{task}"
+        assert stored["task"]["id"] == task
+        for key in ("method", "ablation", "pregrasp", "action", "algo", "seed", "total_frames"):
+            assert stored[key] == wanted[key]
+        assert json.loads((folder / "result.json").read_text())["status"] == "finished"
+
+
+def test_tables_of_stored_results_are_current() -> None:
+    assert study.table(study.figures()) in (study.RESULTS / "README.md").read_text()
+    found = [
+        json.loads((methods.RESULTS / f"{task}-{setting}.json").read_text())
+        for task in methods.TASKS
+        for setting in methods.settings(methods.FRAMES)
+    ]
+    assert methods.table(found) in (methods.RESULTS / "README.md").read_text()
