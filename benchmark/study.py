@@ -1,14 +1,14 @@
 """The paper's comparisons at a hundredth of its length, on the suite quick6; stores runs and page.
 
     python benchmark/study.py                       run what is missing (hours), then report
-    python benchmark/study.py --settings graff      some of the settings only
+    python benchmark/study.py --settings graff-residual      some of the settings only
     python benchmark/study.py --collect             report only
 
 Methods, ablations and the start without a pre-grasp, one seed, 0.5M frames, `algo=ppo_fast
-action=residual`; PGDM, the open hand and no pre-grasp also with the paper's actions. Each setting
-is a sweep (`pgdm-run -m`), so that stopping and starting again goes on where it was. What a run
-leaves is stored without checkpoints and films, its training curve thinned, and `pgdm report` makes
-page and tables from that: a run that is stored is not run again, wherever this is started.
+action=residual`; PGDM, the open hand, 15 cm and no pre-grasp also with the paper's actions. Each
+setting is a sweep (`pgdm-run -m`), so that stopping and starting again goes on where it was. What a
+run leaves is stored without checkpoints and films, its training curve thinned, and `pgdm report`
+makes page and tables from that: a run that is stored is not run again, wherever this is started.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ _CHANGES = {
     "graff": (EXPERTS, ("method=graff",)),
     "curriculum": (TASKS, ("method=curriculum", RAMP)),
 }
-_ALSO_ABSOLUTE = ("pgdm", "no_pregrasp", "open_hand")
+# With the paper's actions as well: residual ones cannot bring the wrist back to where it was.
+_ALSO_ABSOLUTE = ("pgdm", "no_pregrasp", "open_hand", "distance_15cm")
 SETTINGS = {
     f"{name}-{action}": (_CHANGES[name][0], (f"action={action}", *_CHANGES[name][1]))
     for action, names in (("residual", _CHANGES), ("absolute", _ALSO_ABSOLUTE))
