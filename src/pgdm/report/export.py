@@ -79,7 +79,7 @@ def averages(results: Results, rows: Iterable[Average], out: Path) -> None:
     head += ["paper_com_error_same_tasks", "not_comparable_because"]
     table = [
         [
-            *(row.table, results.labels[row.setting], row.name, row.tasks, row.runs),
+            *(row.table, results.labels[row.setting], row.name, len(row.tasks), row.runs),
             *(*row.success, *row.error, *row.rotation),
             *(row.paper.get(name, "") for name in ("success", "com_error", "ori_error")),
             *(row.same["success"], row.same["com_error"], "; ".join(row.deviations)),

@@ -53,10 +53,19 @@ class Setting:
         """Whether episodes start at a pre-grasp."""
         return self.option("pregrasp") != "none"
 
+    @property
+    def plain(self) -> bool:
+        """Whether it is the paper's own method as it stands, which its figures of tasks are of."""
+        return self.method == "pgdm" and self.option("ablation") == "none" and self.with_pregrasp
+
+    def within(self, *groups: str) -> tuple[str, ...]:
+        """Return its changes that belong to some config groups."""
+        return tuple(c for c in self.changes if re.split("[.=]", c)[0] in groups)
+
     def rest(self, *groups: str) -> tuple[str, ...]:
         """Return its changes and its length, without what belongs to some config groups."""
-        changes = (c for c in self.changes if re.split("[.=]", c)[0] not in groups)
-        return *changes, f"{self.total_frames:,} frames"
+        own = self.within(*groups)
+        return *(c for c in self.changes if c not in own), f"{self.total_frames:,} frames"
 
     def deviations(self, *groups: str) -> list[str]:
         """Return why its results cannot be set against the paper's; empty if they can.

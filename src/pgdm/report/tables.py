@@ -64,13 +64,17 @@ class Average:
     """Row of the table: source of pre-grasps, ablation, or method."""
     group: str
     """What its setting differs in besides; only rows of one group compare. Empty: all do."""
-    tasks: int
+    wanted: Callable[[Run], bool]
+    """Tells the runs on the tasks that it is of."""
+    tasks: tuple[str, ...]
+    """Those on which a run has finished."""
     runs: int
     success: Estimate
     error: Estimate
     rotation: Estimate
     same: dict[str, float]
-    """The paper's figures of the same tasks, averaged: ``success`` and ``com_error``."""
+    """The paper's figures of the same tasks, averaged: ``success`` and ``com_error``; NaN where
+    the row is not what they are of, PGDM as it stands."""
     paper: dict[str, float] = field(default_factory=dict)
     """The paper's own average: ``success``, ``com_error``, and ``tasks`` where it says so."""
     deviations: tuple[str, ...] = ()
@@ -114,8 +118,7 @@ def by_source(results: Results) -> list[Average]:
     """Return Table I: each setting with the plain method and pre-grasps, by their source."""
     rows = []
     for setting in results.settings:
-        plain = setting.method == "pgdm" and setting.option("ablation") == "none"
-        if plain and setting.with_pregrasp:
+        if setting.plain:
             for source, figures in paper()["by_source"].items():
                 group = results.labels[setting] if len(results.settings) > 1 else ""
                 rows += _average(results, "source", setting, source, group, figures, _from(source))
@@ -147,8 +150,7 @@ def baselines(results: Results) -> list[Average]:
     groups = _groups(settings, "method", "pregrasp")
     rows = []
     for setting, same in kinds.items():
-        plain = setting.method == "pgdm" and setting.with_pregrasp
-        figures = paper()["by_ablation"]["none"] if plain else {}
+        figures = paper()["by_ablation"]["none"] if setting.plain else {}
         name = f"{setting.method} {'with' if setting.with_pregrasp else 'without'} pre-grasp"
         name += _values(setting, "method")
         args = results, "baseline", setting, name, groups[setting], figures, _in_tcdm30
@@ -215,21 +217,22 @@ def _average(
         values = list(results.scores(setting, metric, wanted).values())
         return statistics.mean(values) if values else NOTHING
 
-    first = [results.cell(setting, task)[0] for task in scores]
+    def stated(figure: str) -> float:
+        first = [results.cell(setting, task)[0] for task in scores]
+        return average(known(run, figure) for run in first) if setting.plain else np.nan
+
     yield Average(
         table=table,
         setting=setting,
         name=name,
         group=group,
-        tasks=len(scores),
+        wanted=wanted,
+        tasks=tuple(scores),
         runs=sum(len(values) for values in scores.values()),
         success=estimate(SUCCESS),
         error=estimate(ERROR),
         rotation=estimate(ROTATION),
-        same={
-            "success": average(known(run, "paper_success") for run in first),
-            "com_error": average(known(run, "paper_com_error") for run in first),
-        },
+        same={"success": stated("paper_success"), "com_error": stated("paper_com_error")},
         paper=figures,
         deviations=tuple(results.deviations(setting, *same)),
     )
