@@ -21,6 +21,7 @@ from pgdm.report import export, figures, tables
 from pgdm.report.curves import curves
 from pgdm.report.results import Results, paper
 from pgdm.report.runs import ERROR, SUCCESS
+from pgdm.report.settings import shared
 from pgdm.report.source import Found, Progress, find
 from pgdm.report.statistics import DRAWS, Estimate
 
@@ -84,6 +85,7 @@ def _context(
         "now": time.strftime("%Y-%m-%d %H:%M"),
         "counts": results.counts(),
         "budgets": Counter(run.budget for run in results.runs),
+        "shared": shared(results.settings),
         "deviations": {s: results.deviations(s) for s in results.settings},
         "colours": {s: figures.colour(results, s) for s in results.settings},
         "averages": averages,
