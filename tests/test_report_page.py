@@ -123,7 +123,9 @@ def test_numbers_can_be_computed_anew_from_runs(page: Path) -> None:
             own = [np.array(v) for (s, _), v in scores.items() if s == row["setting"]]
             assert float(row["value"]) == pytest.approx(statistics.iqm(own).value, rel=1e-5)
     better = next(r for r in rows("statistics", out) if r["statistic"] == "improvement")
-    assert (better["value"], better["tasks"]) == ("1", "1")  # only cup-pour1 is shared
+    counts = better["tasks"], better["runs"], better["than_runs"]
+    assert (better["value"], *counts) == ("1", "1", "2", "1")  # only cup-pour1 is shared
+    assert "pgdm pgdm, pregrasp=none 100.0% [100.0%, 100.0%] 1" in text_of(page.read_text())
 
 
 def test_table_one_and_baselines(page: Path) -> None:
@@ -187,6 +189,21 @@ def test_rows_of_one_name_stand_in_groups_of_their_own(tmp_path: Path) -> None:
         ("no further change", pair),
         ("action=residual", [*pair, "curriculum with pre-grasp, ramp_frames=40"]),
     ]
+
+
+def test_one_run_a_task_is_counted_and_no_probability(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    scores = {"cup-pour1": (0.7, 0.1), "door-open": (0.3, 0.3), "duck-lift": (0.4, 0.2)}
+    for task, pair in scores.items():
+        for source, success in zip(("planned", "none"), pair, strict=True):
+            own = f"task={task}", f"pregrasp={source}", "algo=ppo_fast"
+            make(root / task / source, success, *own)
+    text = text_of(report(root))
+    assert "pgdm pgdm, pregrasp=none 2.5 of 3 tasks 3" in text  # the tie is a half
+    assert "All with algo=ppo_fast." in text
+    row = rows("statistics")[-1]
+    assert (row["value"], row["low"]) == ("0.833333", "")
+    assert (row["tasks"], row["runs"], row["than_runs"]) == ("3", "3", "3")
 
 
 def test_the_overview_has_settings_as_rows_if_they_are_more_than_tasks(tmp_path: Path) -> None:

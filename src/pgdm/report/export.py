@@ -13,7 +13,7 @@ from pgdm.report.results import Results
 from pgdm.report.runs import METRICS, RETURN
 from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
-from pgdm.report.tables import THRESHOLDS, Average, TaskRow
+from pgdm.report.tables import THRESHOLDS, Average, Improvement, TaskRow
 
 FILES = (
     "runs.csv",
@@ -28,7 +28,7 @@ ABLATION = ("ablation_distance_mm", "ablation_retreat_mm", "ablation_finger_erro
 """What a run tells of its ablated start; empty without an ablation."""
 
 Aggregates = dict[Setting, tuple[Estimate, list[Estimate], int, int]]
-Improvements = dict[tuple[Setting, Setting], tuple[Estimate, int]]
+Improvements = dict[tuple[Setting, Setting], Improvement]
 
 
 def runs(results: Results, out: Path) -> None:
@@ -92,13 +92,13 @@ def averages(results: Results, rows: Iterable[Average], out: Path) -> None:
 def statistics(results: Results, found: Aggregates, better: Improvements, out: Path) -> None:
     """Write ``statistics.csv`` and ``profiles.csv``."""
     labels = results.labels
-    head = ["statistic", "setting", "than", "value", "low", "high", "tasks", "runs"]
+    head = ["statistic", "setting", "than", "value", "low", "high", "tasks", "runs", "than_runs"]
     table: list[list[Any]] = [
-        ["interquartile_mean", labels[setting], "", *iqm, tasks, runs]
+        ["interquartile_mean", labels[setting], "", *iqm, tasks, runs, ""]
         for setting, (iqm, _, tasks, runs) in found.items()
     ]
-    for (a, b), (estimate, tasks) in better.items():
-        table.append(["improvement", labels[a], labels[b], *estimate, tasks, ""])
+    for (a, b), (chance, *counts) in better.items():
+        table.append(["improvement", labels[a], labels[b], *chance, *counts])
     _write(out / "statistics.csv", head, table)
     shares = [
         [labels[setting], round(float(threshold), 4), *estimate]

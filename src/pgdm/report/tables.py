@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -79,6 +80,27 @@ class Average:
     """The paper's own average: ``success``, ``com_error``, and ``tasks`` where it says so."""
     deviations: tuple[str, ...] = ()
     """Why it cannot be set against the paper's."""
+
+
+class Improvement(NamedTuple):
+    """How a setting fares against another one on the tasks that both have."""
+
+    chance: Estimate
+    tasks: int
+    runs: int
+    """The setting's on these tasks."""
+    than_runs: int
+    """The other one's."""
+
+    @property
+    def single(self) -> bool:
+        """Whether each has one run a task, so that tasks are counted and nothing is probable."""
+        return self.runs == self.than_runs == self.tasks
+
+    @property
+    def won(self) -> float:
+        """Tasks on which the setting is better, ties as halves, if it is ``single``."""
+        return self.chance.value * self.tasks
 
 
 def task_rows(results: Results, setting: Setting) -> list[TaskRow]:
@@ -170,15 +192,16 @@ def aggregates(results: Results) -> dict[Setting, tuple[Estimate, list[Estimate]
     return found
 
 
-def improvements(results: Results) -> dict[tuple[Setting, Setting], tuple[Estimate, int]]:
-    """Return the probability that one setting beats another, and on how many shared tasks."""
+def improvements(results: Results) -> dict[tuple[Setting, Setting], Improvement]:
+    """Return for each two settings with shared tasks how the first fares against the second."""
     found = {}
     for a, b in combinations(results.settings, 2):
         x, y = results.scores(a), results.scores(b)
         shared = [task for task in x if task in y]
         if shared:
             args = [x[task] for task in shared], [y[task] for task in shared]
-            found[a, b] = statistics.improvement(*args), len(shared)
+            runs = (sum(len(task) for task in side) for side in args)
+            found[a, b] = Improvement(statistics.improvement(*args), len(shared), *runs)
     return found
 
 
