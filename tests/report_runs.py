@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import yaml
 from PIL import Image
 
 from pgdm.config.store import compose_plain
+from pgdm.report.runs import ERROR, METRICS, SUCCESS, Run
+from pgdm.report.settings import Setting
 from pgdm.tracking import RunFolder, RunLog
 
 FRAMES = 40_960
@@ -48,6 +51,33 @@ def make(
     if state != "running":
         (path / "result.json").write_text(json.dumps(result))
     return RunFolder(path)
+
+
+def curve_run(
+    setting: Setting,
+    task: str,
+    points: Mapping[int, float],
+    seed: int = 0,
+    state: str = "finished",
+    **facts: Any,
+) -> Run:
+    """Return a run as it is read, whose evaluations have these successes: frames to success.
+
+    Its error is a hundredth of what the success lacks of 1; its task is one of tcdm30.
+    """
+    success = np.array(list(points.values()))
+    values = {SUCCESS: success, ERROR: (1 - success) / 100}
+    return Run(
+        path=Path(f"{hash(setting)}/{task}/{seed}"),
+        **{"state": state, "setting": setting, "task": task, "seed": seed, "frames": max(points)},
+        budget="smoke",
+        facts={"tcdm30": True, "paper_success": 0.9} | facts,
+        result={},
+        metrics={name: float(curve[-1]) for name, curve in values.items()},
+        evaluations={"frames": np.array(list(points), float)}
+        | {name: values.get(name, success) for name in METRICS},
+        **{"training": {}, "video": None, "modified": 0.0},
+    )
 
 
 def evaluation(success: float) -> dict[str, float]:

@@ -21,6 +21,7 @@ from report_runs import make
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 CSVS = ["averages", "curves", "profiles", "runs", "statistics", "tasks"]
+STATISTICS, CURVES = ["iqm", "profiles"], ["curves", "curves_error"]
 
 
 @pytest.fixture(scope="module")
@@ -88,10 +89,11 @@ def test_no_better_than_doing_nothing_is_red(page: Path) -> None:
 def test_all_files_are_there_and_pictures_are_whole(page: Path) -> None:
     assert sorted(p.stem for p in page.parent.glob("*.csv")) == CSVS
     pictures = sorted(page.parent.glob("*.png"))
-    names = ["baselines", "curves", "curves_error", "iqm", "profiles"]
-    assert [p.stem for p in pictures] == names
+    averages = ["baselines", "baselines_curves", "mean_curves"]
+    assert [p.stem for p in pictures] == sorted([*averages, *STATISTICS, *CURVES])
     inside = re.findall(r'src="data:image/(?:png|jpeg);base64,([^"]+)"', page.read_text())
-    assert len(inside) == 3 + 2 * 3 + 8  # statistics, a panel a task and metric, films
+    # A panel a task and metric, films.
+    assert len(inside) == len([*averages, *STATISTICS]) + 3 * len(CURVES) + 8
     for data in inside:
         with Image.open(io.BytesIO(base64.b64decode(data))) as picture:
             picture.load()
@@ -189,6 +191,15 @@ def test_rows_of_one_name_stand_in_groups_of_their_own(tmp_path: Path) -> None:
         ("no further change", pair),
         ("action=residual", [*pair, "curriculum with pre-grasp, ramp_frames=40"]),
     ]
+
+
+def test_rows_of_different_tasks_do_not_compare(page: Path, tmp_path: Path) -> None:
+    said = "These rows have different tasks and do not compare by their means."
+    assert said not in text_of(page.read_text())
+    for task in ("cup-pour1", "hammer-use1"):
+        make(tmp_path / "runs" / task, 0.7, f"task={task}")
+    make(tmp_path / "runs" / "none", 0.1, "task=cup-pour1", "pregrasp=none")
+    assert text_of(report(tmp_path / "runs")).count(said) == 1
 
 
 def test_one_run_a_task_is_counted_and_no_probability(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import NamedTuple
@@ -175,9 +175,18 @@ def baselines(results: Results) -> list[Average]:
         figures = paper()["by_ablation"]["none"] if setting.plain else {}
         name = f"{setting.method} {'with' if setting.with_pregrasp else 'without'} pre-grasp"
         name += _values(setting, "method")
+        name += "".join(f", {c}" for c in setting.within("pregrasp") if c != "pregrasp=none")
         args = results, "baseline", setting, name, groups[setting], figures, _in_tcdm30
         rows += _average(*args, *same)
     return rows
+
+
+def by_group(rows: Iterable[Average]) -> dict[str, list[Average]]:
+    """Return the rows that compare with one another, by what their settings differ in besides."""
+    found: dict[str, list[Average]] = {}
+    for row in rows:
+        found.setdefault(row.group, []).append(row)
+    return found
 
 
 def aggregates(results: Results) -> dict[Setting, tuple[Estimate, list[Estimate], int, int]]:
