@@ -1,9 +1,12 @@
-"""Finished runs of a few tasks and settings, to report on."""
+"""Runs of a few tasks and settings, and the report on them."""
 
 from __future__ import annotations
 
+import csv
 import json
 import math
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,9 @@ import yaml
 from PIL import Image
 
 from pgdm.config.store import compose_plain
+from pgdm.report.page import write_report
+from pgdm.report.runs import ERROR, METRICS, SUCCESS, Run
+from pgdm.report.settings import Setting
 from pgdm.tracking import RunFolder, RunLog
 
 FRAMES = 40_960
@@ -50,6 +56,33 @@ def make(
     return RunFolder(path)
 
 
+def curve_run(
+    setting: Setting,
+    task: str,
+    points: Mapping[int, float],
+    seed: int = 0,
+    state: str = "finished",
+    **facts: Any,
+) -> Run:
+    """Return a run as it is read, whose evaluations have these successes: frames to success.
+
+    Its error is a hundredth of what the success lacks of 1; its task is one of tcdm30.
+    """
+    success = np.array(list(points.values()))
+    values = {SUCCESS: success, ERROR: (1 - success) / 100}
+    return Run(
+        path=Path(f"{hash(setting)}/{task}/{seed}"),
+        **{"state": state, "setting": setting, "task": task, "seed": seed, "frames": max(points)},
+        budget="smoke",
+        facts={"tcdm30": True, "paper_success": 0.9} | facts,
+        result={},
+        metrics={name: float(curve[-1]) for name, curve in values.items()},
+        evaluations={"frames": np.array(list(points), float)}
+        | {name: values.get(name, success) for name in METRICS},
+        **{"training": {}, "video": None, "modified": 0.0},
+    )
+
+
 def evaluation(success: float) -> dict[str, float]:
     """Return an evaluation's metrics; the errors follow from the success."""
     found = {}
@@ -58,3 +91,22 @@ def evaluation(success: float) -> dict[str, float]:
         named |= {"ori_error": 1.0 - success, "lifted": 0.5, "return": 3.0}
         found |= {f"eval_{kind}/{name}": value for name, value in named.items()}
     return found
+
+
+def report(*places: Path | str, out: Path | None = None) -> str:
+    """Write the report on some folders, by default to ``out``, and return its page."""
+    folder = out or Path("out")
+    page, _ = write_report([str(place) for place in places], folder, lambda *_: None)
+    return page.read_text(encoding="utf-8")
+
+
+def rows(name: str, out: Path | str = "out") -> list[dict[str, str]]:
+    """Return a table of a report."""
+    with open(Path(out) / f"{name}.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def text_of(page: str) -> str:
+    """Return what a page says, without its tags, in one line."""
+    body = re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)
+    return " ".join(re.sub(r"<[^>]+>", " ", body).split())

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import io
 import json
 import re
@@ -17,10 +16,11 @@ from pgdm.cli.main import main
 from pgdm.errors import RunError
 from pgdm.report import statistics
 from pgdm.report.page import write_report
-from report_runs import make
+from report_runs import make, report, rows, text_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 CSVS = ["averages", "curves", "profiles", "runs", "statistics", "tasks"]
+STATISTICS, CURVES = ["iqm", "profiles"], ["curves", "curves_error"]
 
 
 @pytest.fixture(scope="module")
@@ -41,23 +41,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def page(runs: Path) -> Path:
     """Return the report on these runs."""
     return write_report([str(runs)], runs.parent / "out", lambda *_: None)[0]
-
-
-def report(*places: Path | str, out: Path | None = None) -> str:
-    folder = out or Path("out")
-    page, _ = write_report([str(place) for place in places], folder, lambda *_: None)
-    return page.read_text(encoding="utf-8")
-
-
-def rows(name: str, out: Path | str = "out") -> list[dict[str, str]]:
-    with open(Path(out) / f"{name}.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def text_of(page: str) -> str:
-    """Return what a page says, without its tags, in one line."""
-    body = re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)
-    return " ".join(re.sub(r"<[^>]+>", " ", body).split())
 
 
 def test_what_the_page_says(page: Path) -> None:
@@ -88,10 +71,11 @@ def test_no_better_than_doing_nothing_is_red(page: Path) -> None:
 def test_all_files_are_there_and_pictures_are_whole(page: Path) -> None:
     assert sorted(p.stem for p in page.parent.glob("*.csv")) == CSVS
     pictures = sorted(page.parent.glob("*.png"))
-    names = ["baselines", "curves", "curves_error", "iqm", "profiles"]
-    assert [p.stem for p in pictures] == names
+    averages = ["baselines", "baselines_curves", "mean_curves"]
+    assert [p.stem for p in pictures] == sorted([*averages, *STATISTICS, *CURVES])
     inside = re.findall(r'src="data:image/(?:png|jpeg);base64,([^"]+)"', page.read_text())
-    assert len(inside) == 3 + 2 * 3 + 8  # statistics, a panel a task and metric, films
+    # A panel a task and metric, films.
+    assert len(inside) == len([*averages, *STATISTICS]) + 3 * len(CURVES) + 8
     for data in inside:
         with Image.open(io.BytesIO(base64.b64decode(data))) as picture:
             picture.load()
@@ -123,7 +107,9 @@ def test_numbers_can_be_computed_anew_from_runs(page: Path) -> None:
             own = [np.array(v) for (s, _), v in scores.items() if s == row["setting"]]
             assert float(row["value"]) == pytest.approx(statistics.iqm(own).value, rel=1e-5)
     better = next(r for r in rows("statistics", out) if r["statistic"] == "improvement")
-    assert (better["value"], better["tasks"]) == ("1", "1")  # only cup-pour1 is shared
+    counts = better["tasks"], better["runs"], better["than_runs"]
+    assert (better["value"], *counts) == ("1", "1", "2", "1")  # only cup-pour1 is shared
+    assert "pgdm pgdm, pregrasp=none 100.0% [100.0%, 100.0%] 1" in text_of(page.read_text())
 
 
 def test_table_one_and_baselines(page: Path) -> None:
@@ -138,49 +124,11 @@ def test_table_one_and_baselines(page: Path) -> None:
     assert every["not_comparable_because"] == "40,960 of 50,000,000 frames"
     assert float(found["source", "teleop", "1"]["success"]) == 0.8
     assert float(found["source", "mocap", "2"]["success"]) == pytest.approx(0.45)
-    assert found["baseline", "pgdm with pre-grasp", "1"]["success"] == "0.6"  # cup-pour1
-    assert found["baseline", "pgdm without pre-grasp", "1"]["success"] == "0.1"
+    plain = found["baseline", "pgdm with pre-grasp", "1"]  # cup-pour1
+    assert (plain["success"], plain["paper_success_same_tasks"]) == ("0.6", "0.831")
+    bare = found["baseline", "pgdm without pre-grasp", "1"]
+    assert (bare["success"], bare["paper_success_same_tasks"]) == ("0.1", "")
     assert [r for r in rows("averages", out) if r["table"] == "ablation"] == []
-
-
-def test_ablations_stand_beside_the_papers(tmp_path: Path) -> None:
-    make(tmp_path / "runs" / "a", 0.7, "task=cup-pour1")
-    for i, name in enumerate(("distance_15cm", "distance_25cm", "mean_hand", "open_hand")):
-        make(tmp_path / "runs" / name, 0.2 + i / 10, "task=cup-pour1", f"ablation={name}")
-    text = text_of(report(tmp_path / "runs"))
-    assert "Ablations" in text
-    found = [r for r in rows("averages") if r["table"] == "ablation"]
-    assert [(r["row"], r["success"], r["paper_success"]) for r in found] == [
-        ("none", "0.7", "0.755"),
-        ("distance_15cm", "0.2", "0.286"),
-        ("distance_25cm", "0.3", "0.197"),
-        ("mean_hand", "0.4", "0.595"),
-        ("open_hand", "0.5", "0.231"),
-    ]
-
-
-def test_rows_of_one_name_stand_in_groups_of_their_own(tmp_path: Path) -> None:
-    root = tmp_path / "runs"
-    for number, action in enumerate(("absolute", "residual")):
-        own = "task=cup-pour1", f"action={action}"
-        make(root / f"{action}-plain", 0.3 + number / 2, *own)
-        make(root / f"{action}-open", 0.1 + number / 2, *own, "ablation=open_hand")
-        make(root / f"{action}-none", 0.2 + number / 2, *own, "pregrasp=none")
-    ramp = "method.curriculum.ramp_frames=40"
-    make(root / "ramp", 0.4, "task=cup-pour1", "action=residual", "method=curriculum", ramp)
-    page = report(root)
-    tables = page[page.index('id="ablation"') : page.index('id="tasks"')]
-    groups = [
-        (heading, re.findall(r"<tr><th class=\"head\">(.+?) †</th>", rest))
-        for heading, rest in re.findall(r"<h3>(.+?)</h3>(.*?)</table>", tables, re.DOTALL)
-    ]
-    pair = ["pgdm with pre-grasp", "pgdm without pre-grasp"]
-    assert groups == [
-        ("no further change", ["none", "open_hand"]),
-        ("action=residual", ["none", "open_hand"]),
-        ("no further change", pair),
-        ("action=residual", [*pair, "curriculum with pre-grasp, ramp_frames=40"]),
-    ]
 
 
 def test_the_overview_has_settings_as_rows_if_they_are_more_than_tasks(tmp_path: Path) -> None:

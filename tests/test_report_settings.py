@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from pgdm.config.store import compose_plain
-from pgdm.report.settings import Setting, labels, setting_of
+from pgdm.report.settings import Setting, labels, setting_of, shared
 
 
 def setting(*overrides: str, **changes: Any) -> Setting:
@@ -57,10 +57,14 @@ def test_fewer_frames_are_a_deviation_and_more_are_none() -> None:
     assert setting("total_frames=60_000_000").deviations() == []
 
 
-def test_labels_leave_out_what_is_shared() -> None:
+def test_labels_leave_out_what_is_shared_and_it_is_said_once() -> None:
     one = setting("algo=ppo_fast", "action=residual")
     two = setting("algo=ppo_fast", "pregrasp=none")
     assert labels([one]) == {one: "pgdm, action=residual, algo=ppo_fast"}
+    assert shared([one]) == ()
+    assert shared([one, two]) == ("algo=ppo_fast",)
+    graff = [setting("method=graff", f"seed={s}", f"num_envs={n}") for s, n in ((0, 8), (1, 9))]
+    assert shared(graff) == ()  # labels name the method always
     found = labels([one, two])
     assert found[one] == "pgdm, action=residual"
     assert found[two].startswith("pgdm, pregrasp=none")

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from pgdm.config.store import PAPER_FRAMES
-from pgdm.report.figures import DPI, colour, png
+from pgdm.report.figures import DPI, axis_end, colour, png
 from pgdm.report.results import Array, Results, known, paper
 from pgdm.report.runs import ERROR, SUCCESS, Run
 
@@ -30,7 +30,6 @@ _POINTS = 200  # of a mean curve at most
 _NAMES = {SUCCESS: "success", ERROR: "COM error, released form [m]"}
 _PAPER = {SUCCESS: "paper_success", ERROR: "paper_com_error"}
 _GREY = "#888888"
-_HIGHEST = (0.1, 0.2, 0.5, 1.0)  # success that panels may end at
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,7 @@ def _scale(results: Results, metric: str) -> _Scale:
     if metric == SUCCESS:
         levels = [v for task in results.tasks for v, _ in _levels(results, task, metric)]
         most = max([*values[np.isfinite(values)], *levels], default=1.0)
-        return _Scale(False, furthest, 0.0, next(high for high in _HIGHEST if high >= most))
+        return _Scale(False, furthest, 0.0, axis_end(metric, most))
     powers = np.log10(values[np.isfinite(values) & (values > 0)])
     low, high = math.floor(powers.min(initial=-1.0)), math.ceil(powers.max(initial=-2.0))
     return _Scale(True, furthest, low, max(high, low + 1))
@@ -175,12 +174,15 @@ def _scale(results: Results, metric: str) -> _Scale:
 
 def mean_curve(runs: Sequence[Run], metric: str) -> tuple[Array, Array, Array]:
     """Return frames, mean and standard deviation over runs, as far as all of them have come."""
-    last = min(run.evaluations["frames"][-1] for run in runs)
-    frames = np.unique(np.concatenate([run.evaluations["frames"] for run in runs]))
-    frames = frames[frames <= last]
-    frames = frames[:: max(1, len(frames) // _POINTS)]
-    values = np.array(
-        [np.interp(frames, run.evaluations["frames"], run.evaluations[metric]) for run in runs]
-    )
-    spread = values.std(axis=0, ddof=1) if len(runs) > 1 else np.zeros(len(frames))
-    return frames, values.mean(axis=0), spread
+    return mean_line([(run.evaluations["frames"], run.evaluations[metric]) for run in runs])
+
+
+def mean_line(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
+    """Return the same over lines of frames and values."""
+    last = min(frames[-1] for frames, _ in lines)
+    every = np.unique(np.concatenate([frames for frames, _ in lines]))
+    every = every[every <= last]
+    every = every[np.linspace(0, len(every) - 1, min(len(every), _POINTS)).astype(int)]
+    values = np.array([np.interp(every, *line) for line in lines])
+    spread = values.std(axis=0, ddof=1) if len(lines) > 1 else np.zeros(len(every))
+    return every, values.mean(axis=0), spread

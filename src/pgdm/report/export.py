@@ -13,7 +13,7 @@ from pgdm.report.results import Results
 from pgdm.report.runs import METRICS, RETURN
 from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
-from pgdm.report.tables import THRESHOLDS, Average, TaskRow
+from pgdm.report.tables import THRESHOLDS, Average, Improvement, TaskRow
 
 FILES = (
     "runs.csv",
@@ -33,7 +33,7 @@ ABLATION = (
 """What a run tells of its ablated start; empty without an ablation."""
 
 Aggregates = dict[Setting, tuple[Estimate, list[Estimate], int, int]]
-Improvements = dict[tuple[Setting, Setting], tuple[Estimate, int]]
+Improvements = dict[tuple[Setting, Setting], Improvement]
 
 
 def runs(results: Results, out: Path) -> None:
@@ -84,7 +84,7 @@ def averages(results: Results, rows: Iterable[Average], out: Path) -> None:
     head += ["paper_com_error_same_tasks", "not_comparable_because"]
     table = [
         [
-            *(row.table, results.labels[row.setting], row.name, row.tasks, row.runs),
+            *(row.table, results.labels[row.setting], row.name, len(row.tasks), row.runs),
             *(*row.success, *row.error, *row.rotation),
             *(row.paper.get(name, "") for name in ("success", "com_error", "ori_error")),
             *(row.same["success"], row.same["com_error"], "; ".join(row.deviations)),
@@ -97,13 +97,13 @@ def averages(results: Results, rows: Iterable[Average], out: Path) -> None:
 def statistics(results: Results, found: Aggregates, better: Improvements, out: Path) -> None:
     """Write ``statistics.csv`` and ``profiles.csv``."""
     labels = results.labels
-    head = ["statistic", "setting", "than", "value", "low", "high", "tasks", "runs"]
+    head = ["statistic", "setting", "than", "value", "low", "high", "tasks", "runs", "than_runs"]
     table: list[list[Any]] = [
-        ["interquartile_mean", labels[setting], "", *iqm, tasks, runs]
+        ["interquartile_mean", labels[setting], "", *iqm, tasks, runs, ""]
         for setting, (iqm, _, tasks, runs) in found.items()
     ]
-    for (a, b), (estimate, tasks) in better.items():
-        table.append(["improvement", labels[a], labels[b], *estimate, tasks, ""])
+    for (a, b), (chance, *counts) in better.items():
+        table.append(["improvement", labels[a], labels[b], *chance, *counts])
     _write(out / "statistics.csv", head, table)
     shares = [
         [labels[setting], round(float(threshold), 4), *estimate]

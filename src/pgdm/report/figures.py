@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageColor
 
 from pgdm.report.results import Results
+from pgdm.report.runs import ERROR, SUCCESS
 from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
-from pgdm.report.tables import THRESHOLDS, Average
+from pgdm.report.tables import THRESHOLDS, Average, by_group
 
 # Okabe and Ito's colours, which colour-blind people can tell apart, then darker ones.
 COLOURS = (
@@ -24,7 +29,13 @@ COLOURS = (
     *("#332288", "#882255", "#999933", "#44AA99"),
 )
 DPI = 150
+NAMES = {SUCCESS: "success", ERROR: "COM error [m]"}
+RGBA = tuple[float, float, float, float]
+Pairs = tuple[Figure, list[tuple[Axes, Axes]]]
 _WIDTH_IN = 5.2
+_PALE = 0.45  # opacity without pre-grasps
+_HUES = ("method", "ablation", "pregrasp")  # what rows of one hue have in common
+_CEILINGS = (0.1, 0.2, 0.5, 1.0)  # success that axes may end at
 _THUMB = (240, 180)  # pixels of a film's picture
 _SHADES = 12  # of a colour in a drawing: lines have soft edges
 
@@ -60,46 +71,133 @@ def profiles(results: Results, found: dict[Setting, list[Estimate]]) -> Figure:
     return figure
 
 
-def bars(results: Results, rows: Sequence[Average]) -> Figure:
-    """Draw success of methods with (full) and without (pale) pre-grasps."""
-    figure, axes = _rows([", ".join(filter(None, (row.name, row.group))) for row in rows])
-    for number, row in enumerate(rows):
-        value, low, high = row.success
-        alpha = 1.0 if row.setting.with_pregrasp else 0.45
-        axes.barh(number, value, 0.62, color=colour(results, row.setting), alpha=alpha)
-        axes.plot([low, high], [number, number], color="#444444", lw=1.2)
-    axes.set_xlim(0, 1)
-    axes.set_xlabel("success, mean of tasks", fontsize=9)
+def bars(rows: Sequence[Average]) -> Figure:
+    """Draw success and error of methods, each group of rows by itself."""
+    shade, groups = shades(rows), by_group(rows)
+    row_in = _row_in([row.name for row in rows])
+    heights = [row_in * len(own) for own in groups.values()]
+    figure, grid = pairs(heights, 0.95 * len(groups), sharey="row")
+    ends = {
+        SUCCESS: axis_end(SUCCESS, _most(row.success for row in rows)),
+        ERROR: axis_end(ERROR, _most(row.error for row in rows)),
+    }
+    for (group, own), pair in zip(groups.items(), grid, strict=True):
+        for axes, (metric, end) in zip(pair, ends.items(), strict=True):
+            for number, row in enumerate(own):
+                value, low, high = row.success if metric == SUCCESS else row.error
+                axes.barh(number, value, 0.62, color=shade[row.setting])
+                axes.plot([low, high], [number, number], color="#444444", lw=1.2)
+            _name_rows(axes, [row.name for row in own])
+            axes.set_xlim(0, end)
+            few_ticks(axes.xaxis, 3)
+            axes.set_xlabel(f"{NAMES[metric]}\n{_extent(own)}", fontsize=9)
+        pair[0].set_title(wrapped(group, 45), loc="left", fontsize=9)
     return figure
 
 
-def _plain(height_in: float) -> tuple[Figure, Axes]:
-    figure = Figure((_WIDTH_IN, height_in), DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.tick_params(labelsize=9, length=2)
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure, axes
+def shades(rows: Sequence[Average]) -> dict[Setting, RGBA]:
+    """Return the rows' colours: a hue for each method or ablation, pale without pre-grasps."""
+    kinds = {
+        row.setting: tuple(c for c in row.setting.within(*_HUES) if c != "pregrasp=none")
+        for row in rows
+    }
+    hues = list(dict.fromkeys(kinds.values()))
+    return {
+        setting: to_rgba(
+            COLOURS[hues.index(kind) % len(COLOURS)], 1.0 if setting.with_pregrasp else _PALE
+        )
+        for setting, kind in kinds.items()
+    }
 
 
-def _rows(names: Sequence[str]) -> tuple[Figure, Axes]:
-    """Return axes with a named row for each, the first on top."""
-    wrapped = [_wrapped(name) for name in names]
-    lines = max(1 + text.count("\n") for text in wrapped)
-    figure, axes = _plain(0.6 + (0.2 + 0.16 * lines) * len(names))
-    axes.set_yticks(range(len(names)), wrapped)
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    axes.set_axisbelow(True)
-    axes.grid(axis="x", lw=0.4, alpha=0.5)
-    return figure, axes
+def axis_end(metric: str, most: float) -> float:
+    """Return where an axis of success or of error ends, so that its largest value has room."""
+    if metric == SUCCESS:
+        return next(high for high in _CEILINGS if high >= most)
+    return 1.1 * most or 1.0
 
 
-def _wrapped(name: str, width: int = 26) -> str:
+def pairs(heights_in: Sequence[float], more_in: float, **shared: Any) -> Pairs:
+    """Return axes for success and error side by side, a pair for each height.
+
+    Args:
+        heights_in: of the drawings themselves.
+        more_in: what is around all of them.
+        shared: which axes are one, as Matplotlib's ``subplots`` takes it.
+    """
+    figure = _figure(sum(heights_in) + more_in)
+    figure.set_layout_engine("constrained", w_pad=0.1)  # the last tick's text would be cut off
+    grid = figure.subplots(len(heights_in), 2, squeeze=False, height_ratios=heights_in, **shared)
+    for axes in grid.flat:
+        _bare(axes)
+    return figure, [tuple(pair) for pair in grid]
+
+
+def few_ticks(axis: Axis, most: int) -> None:
+    """Mark round values only, shortly written, at no more than a number of steps."""
+    axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10]))
+    axis.set_major_formatter("{x:g}")
+
+
+def wrapped(name: str, width: int = 26) -> str:
+    """Return a name in lines of about a width, cut at its commas."""
     lines = [""]
     for part in name.split(", "):
         glued = f"{lines[-1]}, {part}" if lines[-1] else part
         lines = [*lines[:-1], glued] if len(glued) <= width else [*lines, part]
     return "\n".join(line for line in lines if line)
+
+
+def _most(estimates: Iterable[Estimate]) -> float:
+    return float(np.nanmax([0.0, *np.concatenate(list(estimates))]))
+
+
+def _extent(rows: Sequence[Average]) -> str:
+    """Return what a group's bars are means of; all its runs are equally long."""
+    counts = [len(row.tasks) for row in rows]
+    least, most = min(counts), max(counts)
+    number = f"{least}" if least == most else f"{least} to {most}"
+    lines = [f"mean of {number} task{'s' if most > 1 else ''}"]
+    if len({row.tasks for row in rows}) > 1:
+        lines = [f"{lines[0]},", "not the same"]
+    return "\n".join([*lines, f"{rows[0].setting.total_frames:,} frames"])
+
+
+def _figure(height_in: float) -> Figure:
+    figure = Figure((_WIDTH_IN, height_in), DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _bare(axes: Axes) -> None:
+    axes.tick_params(labelsize=9, length=2)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _plain(height_in: float) -> tuple[Figure, Axes]:
+    figure = _figure(height_in)
+    axes = figure.add_subplot()
+    _bare(axes)
+    return figure, axes
+
+
+def _rows(names: Sequence[str]) -> tuple[Figure, Axes]:
+    """Return axes with a named row for each, the first on top."""
+    figure, axes = _plain(0.6 + _row_in(names) * len(names))
+    _name_rows(axes, names)
+    return figure, axes
+
+
+def _row_in(names: Sequence[str]) -> float:
+    """Return the inches that each of some named rows takes."""
+    return 0.2 + 0.16 * max(1 + wrapped(name).count("\n") for name in names)
+
+
+def _name_rows(axes: Axes, names: Sequence[str]) -> None:
+    axes.set_yticks(range(len(names)), [wrapped(name) for name in names])
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_axisbelow(True)
+    axes.grid(axis="x", lw=0.4, alpha=0.5)
 
 
 def saved(figure: Figure, file: Path) -> bytes:

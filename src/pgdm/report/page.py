@@ -8,19 +8,21 @@ import os
 import shlex
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from matplotlib.figure import Figure
 
 from pgdm.config.store import PAPER_FRAMES
 from pgdm.errors import RunError
-from pgdm.report import export, figures, tables
+from pgdm.report import export, figures, mean_curves, tables
 from pgdm.report.curves import curves
 from pgdm.report.results import Results, paper
 from pgdm.report.runs import ERROR, SUCCESS
+from pgdm.report.settings import shared
 from pgdm.report.source import Found, Progress, find
 from pgdm.report.statistics import DRAWS, Estimate
 
@@ -77,13 +79,14 @@ def _context(
     export.averages(results, [row for rows in averages.values() for row in rows], out)
     export.statistics(results, aggregates, better, out)
     export.curves(results, out)
-    pictures = _pictures(results, averages["baseline"], aggregates, out, progress)
+    pictures = _pictures(results, averages, aggregates, out, progress)
     return {
         "results": results,
         "places": places,
         "now": time.strftime("%Y-%m-%d %H:%M"),
         "counts": results.counts(),
         "budgets": Counter(run.budget for run in results.runs),
+        "shared": shared(results.settings),
         "deviations": {s: results.deviations(s) for s in results.settings},
         "colours": {s: figures.colour(results, s) for s in results.settings},
         "averages": averages,
@@ -106,7 +109,7 @@ def _context(
 
 def _pictures(
     results: Results,
-    baselines: Sequence[tables.Average],
+    averages: Mapping[str, Sequence[tables.Average]],
     aggregates: export.Aggregates,
     out: Path,
     progress: Progress,
@@ -121,16 +124,21 @@ def _pictures(
             )
             found[name] = {task: _data(panel) for task, panel in panels.items()}
     progress("drawing statistics", 0, 1)
+    drawn: dict[str, Figure | None] = {}
     if aggregates:
         iqms = {setting: iqm for setting, (iqm, *_) in aggregates.items()}
         shares = {setting: profile for setting, (_, profile, *_) in aggregates.items()}
-        drawn = figures.intervals(results, iqms, "interquartile mean of success")
-        found["iqm"] = _data(figures.saved(drawn, out / "iqm.png"))
-        drawn = figures.profiles(results, shares)
-        found["profiles"] = _data(figures.saved(drawn, out / "profiles.png"))
-    if baselines:
-        drawn = figures.bars(results, baselines)
-        found["baselines"] = _data(figures.saved(drawn, out / "baselines.png"))
+        drawn["iqm"] = figures.intervals(results, iqms, "interquartile mean of success")
+        drawn["profiles"] = figures.profiles(results, shares)
+    every = [row for row in averages["source"] if row.name == "all"]
+    drawn["mean_curves"] = mean_curves.validated(results, every)
+    drawn["ablations_curves"] = mean_curves.compared(results, averages["ablation"])
+    if averages["baseline"]:
+        drawn["baselines"] = figures.bars(averages["baseline"])
+    drawn["baselines_curves"] = mean_curves.compared(results, averages["baseline"])
+    for name, figure in drawn.items():
+        if figure:
+            found[name] = _data(figures.saved(figure, out / f"{name}.png"))
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -53,10 +53,19 @@ class Setting:
         """Whether episodes start at a pre-grasp."""
         return self.option("pregrasp") != "none"
 
+    @property
+    def plain(self) -> bool:
+        """Whether it is the paper's own method as it stands, which its figures of tasks are of."""
+        return self.method == "pgdm" and self.option("ablation") == "none" and self.with_pregrasp
+
+    def within(self, *groups: str) -> tuple[str, ...]:
+        """Return its changes that belong to some config groups."""
+        return tuple(c for c in self.changes if re.split("[.=]", c)[0] in groups)
+
     def rest(self, *groups: str) -> tuple[str, ...]:
         """Return its changes and its length, without what belongs to some config groups."""
-        changes = (c for c in self.changes if re.split("[.=]", c)[0] not in groups)
-        return *changes, f"{self.total_frames:,} frames"
+        own = self.within(*groups)
+        return *(c for c in self.changes if c not in own), f"{self.total_frames:,} frames"
 
     def deviations(self, *groups: str) -> list[str]:
         """Return why its results cannot be set against the paper's; empty if they can.
@@ -96,15 +105,20 @@ def setting_of(config: Mapping[str, Any]) -> Setting:
     return Setting(tuple(chosen.items()), (*options, *rest), frames)
 
 
-def labels(settings: Iterable[Setting]) -> dict[Setting, str]:
+def shared(settings: Sequence[Setting]) -> tuple[str, ...]:
+    """Return the changes that several settings have in common, but for the method's name."""
+    first, *others = settings
+    common = (c for c in first.changes if all(c in other.changes for other in others))
+    return tuple(c for c in common if others and not c.startswith("method="))
+
+
+def labels(settings: Sequence[Setting]) -> dict[Setting, str]:
     """Return short names that tell settings apart: what all have in common is left out."""
-    settings = list(settings)
-    several = len(settings) > 1
-    shared = set(settings[0].changes).intersection(*(s.changes for s in settings))
+    common = shared(settings)
     lengths = {s.total_frames for s in settings}
     found = {}
     for setting in settings:
-        own = [c for c in setting.changes if not (several and c in shared)]
+        own = [c for c in setting.changes if c not in common]
         parts = [setting.method, *(c for c in own if not c.startswith("method="))]
         if len(lengths) > 1:
             parts.append(f"{setting.total_frames:,} frames")

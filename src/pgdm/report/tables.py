@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,17 +65,42 @@ class Average:
     """Row of the table: source of pre-grasps, ablation, or method."""
     group: str
     """What its setting differs in besides; only rows of one group compare. Empty: all do."""
-    tasks: int
+    wanted: Callable[[Run], bool]
+    """Tells the runs on the tasks that it is of."""
+    tasks: tuple[str, ...]
+    """Those on which a run has finished."""
     runs: int
     success: Estimate
     error: Estimate
     rotation: Estimate
     same: dict[str, float]
-    """The paper's figures of the same tasks, averaged: ``success`` and ``com_error``."""
+    """The paper's figures of the same tasks, averaged: ``success`` and ``com_error``; NaN where
+    the row is not what they are of, PGDM as it stands."""
     paper: dict[str, float] = field(default_factory=dict)
     """The paper's own average: ``success``, ``com_error``, and ``tasks`` where it says so."""
     deviations: tuple[str, ...] = ()
     """Why it cannot be set against the paper's."""
+
+
+class Improvement(NamedTuple):
+    """How a setting fares against another one on the tasks that both have."""
+
+    chance: Estimate
+    tasks: int
+    runs: int
+    """The setting's on these tasks."""
+    than_runs: int
+    """The other one's."""
+
+    @property
+    def single(self) -> bool:
+        """Whether each has one run a task, so that tasks are counted and nothing is probable."""
+        return self.runs == self.than_runs == self.tasks
+
+    @property
+    def won(self) -> float:
+        """Tasks on which the setting is better, ties as halves, if it is ``single``."""
+        return self.chance.value * self.tasks
 
 
 def task_rows(results: Results, setting: Setting) -> list[TaskRow]:
@@ -114,8 +140,7 @@ def by_source(results: Results) -> list[Average]:
     """Return Table I: each setting with the plain method and pre-grasps, by their source."""
     rows = []
     for setting in results.settings:
-        plain = setting.method == "pgdm" and setting.option("ablation") == "none"
-        if plain and setting.with_pregrasp:
+        if setting.plain:
             for source, figures in paper()["by_source"].items():
                 group = results.labels[setting] if len(results.settings) > 1 else ""
                 rows += _average(results, "source", setting, source, group, figures, _from(source))
@@ -147,13 +172,21 @@ def baselines(results: Results) -> list[Average]:
     groups = _groups(settings, "method", "pregrasp")
     rows = []
     for setting, same in kinds.items():
-        plain = setting.method == "pgdm" and setting.with_pregrasp
-        figures = paper()["by_ablation"]["none"] if plain else {}
+        figures = paper()["by_ablation"]["none"] if setting.plain else {}
         name = f"{setting.method} {'with' if setting.with_pregrasp else 'without'} pre-grasp"
         name += _values(setting, "method")
+        name += "".join(f", {c}" for c in setting.within("pregrasp") if c != "pregrasp=none")
         args = results, "baseline", setting, name, groups[setting], figures, _in_tcdm30
         rows += _average(*args, *same)
     return rows
+
+
+def by_group(rows: Iterable[Average]) -> dict[str, list[Average]]:
+    """Return the rows that compare with one another, by what their settings differ in besides."""
+    found: dict[str, list[Average]] = {}
+    for row in rows:
+        found.setdefault(row.group, []).append(row)
+    return found
 
 
 def aggregates(results: Results) -> dict[Setting, tuple[Estimate, list[Estimate], int, int]]:
@@ -168,15 +201,16 @@ def aggregates(results: Results) -> dict[Setting, tuple[Estimate, list[Estimate]
     return found
 
 
-def improvements(results: Results) -> dict[tuple[Setting, Setting], tuple[Estimate, int]]:
-    """Return the probability that one setting beats another, and on how many shared tasks."""
+def improvements(results: Results) -> dict[tuple[Setting, Setting], Improvement]:
+    """Return for each two settings with shared tasks how the first fares against the second."""
     found = {}
     for a, b in combinations(results.settings, 2):
         x, y = results.scores(a), results.scores(b)
         shared = [task for task in x if task in y]
         if shared:
             args = [x[task] for task in shared], [y[task] for task in shared]
-            found[a, b] = statistics.improvement(*args), len(shared)
+            runs = (sum(len(task) for task in side) for side in args)
+            found[a, b] = Improvement(statistics.improvement(*args), len(shared), *runs)
     return found
 
 
@@ -215,21 +249,22 @@ def _average(
         values = list(results.scores(setting, metric, wanted).values())
         return statistics.mean(values) if values else NOTHING
 
-    first = [results.cell(setting, task)[0] for task in scores]
+    def stated(figure: str) -> float:
+        first = [results.cell(setting, task)[0] for task in scores]
+        return average(known(run, figure) for run in first) if setting.plain else np.nan
+
     yield Average(
         table=table,
         setting=setting,
         name=name,
         group=group,
-        tasks=len(scores),
+        wanted=wanted,
+        tasks=tuple(scores),
         runs=sum(len(values) for values in scores.values()),
         success=estimate(SUCCESS),
         error=estimate(ERROR),
         rotation=estimate(ROTATION),
-        same={
-            "success": average(known(run, "paper_success") for run in first),
-            "com_error": average(known(run, "paper_com_error") for run in first),
-        },
+        same={"success": stated("paper_success"), "com_error": stated("paper_com_error")},
         paper=figures,
         deviations=tuple(results.deviations(setting, *same)),
     )

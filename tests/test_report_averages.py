@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from report_runs import make, report, rows, text_of
+
+
+def test_ablations_stand_beside_the_papers(tmp_path: Path) -> None:
+    names = ("none", "distance_15cm", "distance_25cm", "mean_hand", "open_hand")
+    for i, name in enumerate(names):
+        own = f"ablation={name}"
+        make(tmp_path / "runs" / name, 0.2 + i / 10, "task=cup-pour1", own)
+        make(tmp_path / "runs" / f"{name}-door", 1.0, "task=door-open", own)  # not in tcdm30
+    text = text_of(report(tmp_path / "runs"))
+    assert "Ablations" in text
+    found = [r for r in rows("averages") if r["table"] == "ablation"]
+    columns = ("row", "tasks", "success", "paper_success", "paper_success_same_tasks")
+    # What the paper has of single tasks is of no ablation.
+    assert [tuple(r[column] for column in columns) for r in found] == [
+        ("none", "1", "0.2", "0.755", "0.831"),
+        ("distance_15cm", "1", "0.3", "0.286", ""),
+        ("distance_25cm", "1", "0.4", "0.197", ""),
+        ("mean_hand", "1", "0.5", "0.595", ""),
+        ("open_hand", "1", "0.6", "0.231", ""),
+    ]
+
+
+def test_rows_of_one_name_stand_in_groups_of_their_own(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    for number, action in enumerate(("absolute", "residual")):
+        own = "task=cup-pour1", f"action={action}"
+        make(root / f"{action}-plain", 0.3 + number / 2, *own)
+        make(root / f"{action}-open", 0.1 + number / 2, *own, "ablation=open_hand")
+        make(root / f"{action}-none", 0.2 + number / 2, *own, "pregrasp=none")
+    ramp = "method.curriculum.ramp_frames=40"
+    make(root / "ramp", 0.4, "task=cup-pour1", "action=residual", "method=curriculum", ramp)
+    page = report(root)
+    tables = page[page.index('id="ablation"') : page.index('id="tasks"')]
+    groups = [
+        (heading, re.findall(r"<tr><th class=\"head\">(.+?) †</th>", rest))
+        for heading, rest in re.findall(r"<h3>(.+?)</h3>(.*?)</table>", tables, re.DOTALL)
+    ]
+    pair = ["pgdm with pre-grasp", "pgdm without pre-grasp"]
+    assert groups == [
+        ("no further change", ["none", "open_hand"]),
+        ("action=residual", ["none", "open_hand"]),
+        ("no further change", pair),
+        ("action=residual", [*pair, "curriculum with pre-grasp, ramp_frames=40"]),
+    ]
+
+
+def test_rows_of_different_tasks_do_not_compare(tmp_path: Path) -> None:
+    said = "These rows have different tasks and do not compare by their means."
+    make(tmp_path / "runs" / "cup", 0.7, "task=cup-pour1")
+    make(tmp_path / "runs" / "none", 0.1, "task=cup-pour1", "pregrasp=none")
+    assert said not in text_of(report(tmp_path / "runs"))
+    make(tmp_path / "runs" / "hammer", 0.7, "task=hammer-use1")
+    assert text_of(report(tmp_path / "runs")).count(said) == 1
+
+
+def test_one_run_a_task_is_counted_and_no_probability(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    scores = {"cup-pour1": (0.7, 0.1), "door-open": (0.3, 0.3), "duck-lift": (0.4, 0.2)}
+    for task, pair in scores.items():
+        for source, success in zip(("planned", "none"), pair, strict=True):
+            own = f"task={task}", f"pregrasp={source}", "algo=ppo_fast"
+            make(root / task / source, success, *own)
+    text = text_of(report(root))
+    assert "pgdm pgdm, pregrasp=none 2.5 of 3 tasks 3" in text  # the tie is a half
+    assert "All with algo=ppo_fast." in text
+    row = rows("statistics")[-1]
+    assert (row["value"], row["low"]) == ("0.833333", "")
+    assert (row["tasks"], row["runs"], row["than_runs"]) == ("3", "3", "3")

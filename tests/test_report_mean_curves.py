@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from pgdm.config.store import compose_plain
+from pgdm.report import figures, mean_curves, tables
+from pgdm.report.results import Results
+from pgdm.report.runs import ERROR, SUCCESS
+from pgdm.report.settings import Setting, setting_of
+from report_runs import curve_run
+
+STEEP = {0: 0.0, 10: 0.2, 20: 0.4, 40: 0.8}
+FLAT = {0: 0.0, 40: 0.0}
+
+
+@cache
+def setting(*overrides: str) -> Setting:
+    return setting_of(compose_plain(overrides))
+
+
+def lines(axes: Axes) -> list[list[tuple[float, float]]]:
+    """Return what is drawn: frames and values of each line."""
+    points = [np.asarray(line.get_xydata()).tolist() for line in axes.lines]
+    return [[(round(1e6 * x), round(y, 9)) for x, y in line] for line in points]
+
+
+def bars(axes: Axes) -> tuple[list[float], list[tuple[float, ...]]]:
+    """Return what is drawn: the widths and colours of bars."""
+    drawn = [bar for bar in axes.patches if isinstance(bar, Rectangle)]
+    return [bar.get_width() for bar in drawn], [to_rgba(bar.get_facecolor()) for bar in drawn]
+
+
+def titles(figure: Figure) -> list[str]:
+    return [axes.get_title("left") for axes in figure.axes if axes.get_title("left")]
+
+
+def test_each_task_weighs_the_same_by_hand() -> None:
+    plain = setting()
+    one = [curve_run(plain, "a", STEEP)]
+    two = [curve_run(plain, "b", {0: 0.0, 20: 0.4, 30: 0.6}), curve_run(plain, "b", FLAT, seed=1)]
+    # Of the second task 0, 0.2, 0.3 at 0, 20, 30; the first is 0.6 at 30, where all have come.
+    frames, mean = mean_curves.over_tasks([one, two], SUCCESS)
+    assert frames.tolist() == [0, 10, 20, 30]
+    assert mean.tolist() == pytest.approx([0, 0.15, 0.3, 0.45])
+    _, error = mean_curves.over_tasks([one, two], ERROR)
+    assert error.tolist() == pytest.approx([0.01, 0.0085, 0.007, 0.0055])
+
+
+def test_baselines_are_of_the_tasks_that_all_have() -> None:
+    plain, mimic, bare = setting(), setting("method=deepmimic"), setting("pregrasp=none")
+    results = Results(
+        [
+            curve_run(plain, "a", STEEP),
+            curve_run(plain, "b", {0: 0.2, 20: 0.4}),
+            curve_run(plain, "c", {0: 1.0, 40: 1.0}),  # nowhere else
+            curve_run(mimic, "a", FLAT),
+            curve_run(mimic, "b", {0: 0.0, 40: 0.4}),
+            curve_run(mimic, "d", {0: 1.0, 40: 1.0}, tcdm30=False),
+            curve_run(bare, "a", FLAT),
+            curve_run(bare, "b", {0: 0.0, 30: 0.0}, state="running"),
+            curve_run(bare, "b", {0: 0.0, 10: 0.0}, seed=1, state="failed"),
+        ]
+    )
+    rows = tables.baselines(results)
+    figure = mean_curves.compared(results, rows)
+    assert figure is not None
+    assert titles(figure) == ["mean of the 2 tasks that all have"]
+    success, error = figure.axes
+    assert lines(success) == [
+        [(0, 0.1), (10, 0.25), (20, 0.4)],
+        [(0, 0.0), (40, 0.2)],
+        [(0, 0.0), (30, 0.0)],
+    ]
+    assert lines(error)[1] == [(0, 0.01), (40, 0.008)]
+    assert [text.get_text() for text in figure.legends[0].texts] == [
+        "pgdm with pre-grasp",
+        "deepmimic with pre-grasp",
+        "pgdm without pre-grasp",
+    ]
+    styles = [line.get_linestyle() for line in success.lines]
+    assert styles == ["-", "-", "--"]
+    high = success.get_ylim()[1]
+    assert high == 0.5  # of the best line in the picture, 0.4
+
+
+def test_groups_have_panels_of_their_own_and_one_scale() -> None:
+    runs = []
+    for action, best in (("absolute", 0.05), ("residual", 0.7)):
+        for ablation in ("none", "open_hand"):
+            made = setting(f"action={action}", f"ablation={ablation}")
+            runs.append(curve_run(made, "a", {0: 0.0, 40: best}))
+    results = Results([*runs, curve_run(runs[0].setting, "b", STEEP)])
+    figure = mean_curves.compared(results, tables.by_ablation(results))
+    assert figure is not None
+    assert titles(figure) == [
+        "no further change, mean of the 1 task that all have",
+        "action=residual, mean of the 1 task that all have",
+    ]
+    small, _, large, _ = figure.axes
+    assert lines(small) == [[(0, 0.0), (40, 0.05)]] * 2
+    assert lines(large) == [[(0, 0.0), (40, 0.7)]] * 2
+    assert small.get_ylim() == large.get_ylim() == (-0.02, 1.0)
+
+
+def test_nothing_is_drawn_where_nothing_is_shared_or_evaluated() -> None:
+    plain, bare = setting(), setting("pregrasp=none")
+    apart = Results([curve_run(plain, "a", STEEP), curve_run(bare, "b", FLAT)])
+    assert len(tables.baselines(apart)) == 2
+    assert mean_curves.compared(apart, tables.baselines(apart)) is None
+    once = Results([curve_run(plain, "a", {40: 0.5})])
+    assert len(tables.by_source(once)) == 1
+    assert mean_curves.validated(once, tables.by_source(once)) is None
+
+
+def test_table_one_has_a_thin_line_for_each_seed_with_all_tasks() -> None:
+    plain = setting()
+    ends = {("a", 0): 0.4, ("a", 1): 0.8, ("b", 0): 0.2, ("b", 1): 0.0, ("b", 2): 0.7}
+    runs = [curve_run(plain, t, {0: 0.0, 40: end}, seed=s) for (t, s), end in ends.items()]
+    beyond = curve_run(plain, "c", STEEP, paper_success=None)  # no task of the paper's
+    results = Results([*runs, beyond])
+    figure = mean_curves.validated(results, tables.by_source(results))
+    assert figure is not None
+    assert titles(figure) == ["mean of 2 tasks; thin: 2 of 3 seeds"]
+    # Seeds: (0.4 + 0.2) / 2 and (0.8 + 0) / 2; all: ((0.4 + 0.8) / 2 + (0.2 + 0 + 0.7) / 3) / 2.
+    assert [line[-1] for line in lines(figure.axes[0])] == [(40, 0.3), (40, 0.4), (40, 0.45)]
+    thin, other, thick = (line.get_linewidth() for line in figure.axes[0].lines)
+    assert thin == other < thick
+    alone = Results(runs[::2][:1])
+    figure = mean_curves.validated(alone, tables.by_source(alone))
+    assert figure is not None
+    assert titles(figure) == ["mean of 1 task"]
+    assert lines(figure.axes[0]) == [[(0, 0.0), (40, 0.4)]]
+
+
+def test_bars_are_success_and_error_of_each_row() -> None:
+    plain, mimic, bare = setting(), setting("method=deepmimic"), setting("pregrasp=none")
+    results = Results(
+        [
+            curve_run(plain, "a", {0: 0.0, 40: 0.8}),
+            curve_run(plain, "b", {0: 0.0, 40: 0.4}),
+            curve_run(mimic, "a", {0: 0.0, 40: 0.5}),
+            curve_run(bare, "a", {0: 0.0, 40: 0.1}),
+        ]
+    )
+    figure = figures.bars(tables.baselines(results))
+    success, error = figure.axes
+    assert bars(success)[0] == pytest.approx([0.6, 0.5, 0.1])
+    assert bars(error)[0] == pytest.approx([0.004, 0.005, 0.009])
+    names = [label.get_text() for label in success.get_yticklabels()]
+    assert names == ["pgdm with pre-grasp", "deepmimic with pre-grasp", "pgdm without pre-grasp"]
+    extent = "mean of 1 to 2 tasks,\nnot the same\n50,000,000 frames"
+    assert success.get_xlabel() == f"success\n{extent}"
+    assert error.get_xlabel() == f"COM error [m]\n{extent}"
+    for axes in (success, error):
+        pgdm, deepmimic, pale = bars(axes)[1]
+        assert pgdm[:3] == pale[:3] != deepmimic[:3]
+        assert pgdm[3] == deepmimic[3] == 1.0 > pale[3]
+
+
+def test_pregrasps_of_two_sources_have_names_and_hues_of_their_own() -> None:
+    made = [setting(f"pregrasp={source}") for source in ("planned", "mined", "none")]
+    rows = tables.baselines(Results([curve_run(s, "a", FLAT) for s in made]))
+    assert [row.name for row in rows] == [
+        "pgdm with pre-grasp",
+        "pgdm with pre-grasp, pregrasp=mined",
+        "pgdm without pre-grasp",
+    ]
+    planned, mined, none = figures.shades(rows).values()
+    assert planned[:3] == none[:3] != mined[:3]
