@@ -5,7 +5,8 @@
 Fetches what it can, other tasks need a checkout; ``pregrasp=planned`` falls back to mined where no
 plan is stored. Prints a summary in Markdown, as on docs/ablations.md, and writes every start as
 CSV. The column ``residual_gap_m`` tells how far the fingertips stay from their places in the
-pre-grasp, on average, if an action of ``action=residual`` corrects the wrist as well as it can.
+pre-grasp (of ``none``: the planned one), on average, if an action of ``action=residual`` corrects
+the wrist as well as it can.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ from pgdm.config.groups import available
 from pgdm.config.store import compose
 from pgdm.experiment import assets, env_builder
 from pgdm.pregrasp.ablate import ablate
-from pgdm.pregrasp.sources import start_state
+from pgdm.pregrasp.sources import StartState, start_state
 from pgdm.sim.scene import Scene
 
-STARTS = ("planned", "mined")
+STARTS = ("planned", "mined", "none")  # the last, the reset pose, has nothing to ablate
 SCALE = compose(["action=residual"]).action.residual_scale
 RESULTS = Path(__file__).parent / "results" / "ablations.csv"
 
@@ -41,8 +42,9 @@ def measure(task: str) -> list[dict[str, Any]]:
     rows = []
     whole = compose([f"task={task}"])
     builder = env_builder(whole, assets(whole, print))
+    goals: dict[str, StartState] = {}
     for pregrasp in STARTS:
-        for ablation in available("ablation"):
+        for ablation in available("ablation") if pregrasp != "none" else ("none",):
             # The task does not matter here, so that each choice is composed only once.
             cfg = compose([f"pregrasp={pregrasp}", f"ablation={ablation}"])
             stored = start_state(cfg.pregrasp, builder.motion, builder.scene)
@@ -50,7 +52,9 @@ def measure(task: str) -> list[dict[str, Any]]:
             found = ablate(cfg.ablation, stored, builder.scene, builder.motion.substeps)
             seconds = time.process_time() - began
             figures = {k: v for k, v in dataclasses.asdict(found).items() if k != "start"}
-            gap = residual_gap(builder.scene, stored.qpos, found.start.qpos)
+            goals.setdefault(pregrasp, stored)
+            goal = goals["planned" if pregrasp == "none" else pregrasp]
+            gap = residual_gap(builder.scene, goal.qpos, found.start.qpos)
             row = {"pregrasp": pregrasp, "ablation": ablation, "task": task, **figures}
             row["residual_gap_m"] = gap
             rows.append(row | {"seconds": seconds})
