@@ -41,6 +41,14 @@ def assert_helps(outcome: Outcome, *said: str, code: int | None = None) -> None:
         (["seeed=1"], ["unknown key 'seeed'", "did you mean seed"]),
         (["algo.lr=1e-4"], ["unknown key 'algo.lr'", "pgdm-run --help"]),
         (["+algo.lr=1e-4"], ["unknown key of 'algo' 'lr'", "learning_rate"]),
+        (
+            ["method.curriculum.ramp_frames=9"],
+            ["'method.curriculum.ramp_frames' is a setting of method=curriculum or full only"],
+        ),
+        (
+            ["method=full", "method.imitation=null", "method.imitation.weight=2"],
+            ["'method.imitation.weight' cannot be set, as method.imitation is null here"],
+        ),
         (["pregrap=mined"], ["unknown key 'pregrap'", "pregrasp"]),
         (["+experiment=quick"], ["unknown experiment 'quick'", "quickstart"]),
         (["experiment=quickstart"], ["+experiment=NAME"]),

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 from filelock import FileLock
 from typer.testing import CliRunner
 
@@ -34,13 +35,20 @@ def test_table_of_a_finished_run(tmp_path: Path) -> None:
     finished(tmp_path / "runs" / RUN)
     head, line, *_ = pgdm_runs().splitlines()
     assert head.split() == [
-        *("task", "method", "algo", "action", "seed", "frames", "success", "error", "lifted"),
-        *("steps/s", "status", "when", "run"),
+        *("task", "method", "algo", "action", "start", "seed", "frames", "success", "error"),
+        *("lifted", "steps/s", "status", "when", "run"),
     ]
     assert line.split() == [
-        *("hammer-use1", "pgdm", "ppo_fast", "residual", "0", "40,960", "10.0%", "3.00e-04", "50%"),
-        *("1,988", "finished", "just", "now", RUN),
+        *("hammer-use1", "pgdm", "ppo_fast", "residual", "planned", "0", "40,960", "10.0%"),
+        *("3.00e-04", "50%", "1,988", "finished", "just", "now", RUN),
     ]
+
+
+def test_ablated_starts_are_told_apart(tmp_path: Path) -> None:
+    folder = make(tmp_path / "runs" / "a")
+    config = {**folder.config, "ablation": {"name": "open_hand"}}
+    (folder.path / "config.yaml").write_text(yaml.safe_dump(config))
+    assert "planned open_hand" in " ".join(pgdm_runs().splitlines()[1].split())
 
 
 def test_folder_can_be_named_with_and_without_the_command(tmp_path: Path) -> None:
@@ -61,6 +69,8 @@ def test_program_readable_rows(tmp_path: Path) -> None:
         "method": "pgdm",
         "algo": "ppo_fast",
         "action": "residual",
+        "start": "planned",
+        "ablation": "none",
         "seed": 7,
         "frames": LENGTH * STEP,
         "success": 0.1,
@@ -88,7 +98,7 @@ def test_run_that_has_just_started_and_one_that_is_damaged(tmp_path: Path) -> No
     make(tmp_path / "runs" / "a")
     (make(tmp_path / "runs" / "b[1]").path / "config.yaml").write_text("[")
     lines = pgdm_runs().splitlines()[1:3]
-    assert lines[0].split()[5:9] == ["-", "-", "-", "-"]
+    assert lines[0].split()[6:10] == ["-", "-", "-", "-"]
     assert "unreadable" in lines[1] and "b[1]" in lines[1]
 
 

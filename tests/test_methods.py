@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import sys
 from dataclasses import replace
@@ -13,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from command_line import TINY, command
+from command_line import TINY, command, process
 from pgdm.config.groups import available
 from pgdm.config.identity import default_run_dir, identity, identity_hash
 from pgdm.config.saved import load_config, save_config
@@ -30,6 +31,7 @@ from pgdm.mdp.recipe import Measure
 from pgdm.methods import METHODS, pgdm, recipe
 from pgdm.tracking.run_log import RunLog
 
+REPOSITORY = Path(__file__).resolve().parents[1]
 PGDM = {"tracking", "lift"}
 ADDED = {
     "pgdm": set(),
@@ -312,6 +314,7 @@ def test_a_curriculum_is_recorded_and_does_not_act_on_evaluations(library_home: 
     )  # fmt: skip
     assert outcome.code == 0, outcome.err
     assert "rewards tracking 10, scheduled from 0, lift 2.5; ends object_lost" in outcome.err
+    assert "cup-pour1: method curriculum, hand adroit, pregrasp planned, " in outcome.err
     lines = RunLog(Path("run/metrics.jsonl")).read()
     trained = [line for line in lines if line["kind"] == "train"]
     assert [line["train/weight/tracking"] for line in trained] == [0.0, 5.0]
@@ -321,6 +324,43 @@ def test_a_curriculum_is_recorded_and_does_not_act_on_evaluations(library_home: 
         whole = 10 * float(line["eval_sampled/raw/tracking"])
         assert float(line["eval_sampled/term/tracking"]) == pytest.approx(whole)
         assert whole > 0
+
+
+BROKEN = """
+from dataclasses import replace
+{top}
+from pgdm.mdp.recipe import RewardTerm
+from pgdm.methods import Method, MethodCfg, pgdm
+
+def recipe(cfg):
+    base = pgdm.recipe(cfg)
+    return replace(base, rewards=(*base.rewards, RewardTerm({name!r}, 1.0, lambda c: {value})))
+
+OWN = Method(MethodCfg, recipe)
+"""
+
+
+@pytest.mark.parametrize(
+    ("top", "name", "value", "said"),
+    [
+        ("", "mine", "c.object_eror", "mine_method.py, line 9; --debug shows"),
+        ("", "mine", "c.target_pos", "reward 'mine' of this method gives values of shape (2, 3)"),
+        ("", "lift", "c.object_error", "has the RewardTerm 'lift' twice"),
+        ("import torchh", "mine", "c.object_error", "the module is there, but not all that it"),
+    ],
+)
+def test_a_defect_of_ones_own_method_is_told_where_it_is(
+    top: str, name: str, value: str, said: str, tmp_path: Path, library_home: Path
+) -> None:
+    text = BROKEN.format(top=top, name=name, value=value)
+    (tmp_path / "mine_method.py").write_text(text)
+    outcome = process(
+        *("pgdm-run", *TINY, "task=cup-pour1", "method.name='mine_method:OWN'", "--offline"),
+        "run_dir=run",
+        env={"PYTHONPATH": os.pathsep.join([str(REPOSITORY / "src"), str(tmp_path)])},
+    )
+    assert outcome.code != 0 and len(outcome.errors) == 1, outcome.err
+    assert said in outcome.errors[0]
 
 
 def test_a_method_of_ones_own_needs_no_change_here(

@@ -82,19 +82,34 @@ def wanted_start(cfg: ExperimentCfg, library: Library) -> Wanted:
     return Wanted(cfg.task, cfg.hand, own_hand(cfg, library), cfg.sim, cfg.pregrasp.source)
 
 
-def check_startable(cfg: ExperimentCfg, library: Library) -> None:
-    """Check that an experiment has its start and its expert, as far as nothing is to be made first.
+def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
+    """Return what a run would say of itself, as far as nothing is to be fetched or made first.
 
     Raises:
-        ConfigError: if one is missing, and would not be fetched or made.
+        ConfigError: if its start is missing, and would not be made.
     """
-    if cfg.task.motion not in library.tasks():
-        return
-    if recipe(cfg.method).needs_expert and cfg.task.motion not in library.experts().experts:
-        return
+    task = cfg.task.motion
+    if task not in library.tasks():
+        return [f"the assets of '{task}' are not here yet"]
+    if recipe(cfg.method).needs_expert and task not in library.experts().experts:
+        return [f"the expert hand trajectory of '{task}' is fetched first"]
     start = wanted_start(cfg, library)
-    if start.path.is_file() or not start.can_be_made:
-        env_builder(cfg, library)
+    if start.can_be_made and not start.path.is_file():
+        return [f"the start '{cfg.pregrasp.source}' of '{task}' is made first"]
+    return notes(cfg, env_builder(cfg, library))
+
+
+def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
+    """Return sentences on what in a run is not as one might think."""
+    late = builder.mdp.recipe.unfinished(cfg.total_frames)
+    return [
+        *builder.notes,
+        *(
+            f"the weight of '{name}' only comes to {last:.3g} of {weight:g} in "
+            f"{cfg.total_frames:,} frames: its schedule is longer than the run"
+            for name, last, weight in late
+        ),
+    ]
 
 
 def threads(cfg: ExperimentCfg) -> int:
@@ -135,12 +150,11 @@ def check_assets(
     Raises:
         RunError: if not; names what differs.
     """
-    for key, now in builder.facts().items():
-        if metadata.get(key) != now:
-            raise RunError(
-                f"{where} was made with {key} '{metadata.get(key)}', the library now has '{now}'; "
-                "restore the library, or start anew in another run_dir"
-            )
+    for text in builder.differences(metadata):
+        raise RunError(
+            f"{where} was made with {text}; restore the library (pgdm assets list), or start anew "
+            "in another run_dir"
+        )
     before, now = metadata.get("versions", {}), versions()
     for package in ("mujoco", "torch"):
         if before.get(package) != now[package]:
@@ -177,8 +191,10 @@ class Run(Callback):
         done = state is not None and int(state["frames"]) >= self.cfg.total_frames
         if done and stored.get("status") == "finished":
             self._notify(f"{self.dir} is finished already; its result:")
+            for text in self.builder.differences(stored):
+                self._notify(f"note: it was made with {text}")
             return self._stored_result(stored)
-        for note in self.builder.notes:
+        for note in notes(self.cfg, self.builder):
             self._notify(note)
         trainer = self._make_trainer((self, *callbacks), stop)
         if state is not None:

@@ -10,7 +10,8 @@ from pgdm.config.groups import available
 from pgdm.config.store import compose
 from pgdm.errors import ConfigError
 from pgdm.experiment import assets, env_builder
-from pgdm.pregrasp.ablate import FINGERS, Ablated, ablate
+from pgdm.pregrasp.ablate import FINGERS, ablate
+from pgdm.pregrasp.ablated import Ablated
 from pgdm.pregrasp.sources import start_state
 
 
@@ -41,17 +42,14 @@ def view_ablations(
     for ablation in found:
         ablated = ablate(ablation, stored, scene, motion.substeps)
         title = f"{task}  {ablation.name}" if ablation.changes_start else f"{task}  {stored.source}"
-        panels.append(Panel(ablated.start.qpos, title, _figures(ablated)))
-        print(f"{ablation.name:16}{panels[-1].text}")
+        text = _figures(ablated, ablation.distance_m)
+        panels.append(Panel(ablated.start.qpos, title, text))
+        print(f"{ablation.name:16}{text}")
     print(f"image: {write_sheet(scene, panels, image)}")
 
 
-def _figures(ablated: Ablated) -> str:
+def _figures(ablated: Ablated, asked_m: float) -> str:
     parts = [f"penetration {1e3 * ablated.depth_m:.1f} mm"]
     if ablated.distance_m > 0:
         parts.append(f"wrist {1e2 * ablated.distance_m:.1f} cm off")
-    if ablated.retreat_m > 0:
-        parts.append(f"of it {1e3 * ablated.retreat_m:.0f} mm retreat")
-    if ablated.finger_error_rad > 0:
-        parts.append(f"fingers stop {ablated.finger_error_rad:.2f} rad before")
-    return ", ".join(parts)
+    return ", ".join(filter(None, (*parts, ablated.compromises(asked_m))))

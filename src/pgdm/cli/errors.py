@@ -8,6 +8,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import TracebackType
 
 from pgdm.errors import ConfigError, PgdmError
@@ -68,9 +69,18 @@ def message(error: BaseException) -> str:
     elif isinstance(error, OSError):
         text = _os_message(error)
     else:
-        name = type(error).__name__
-        text = f"{name}: {error} (a defect of pgdm: please report it with what --debug shows)"
+        text = f"{type(error).__name__}: {error} ({_culprit(error)})"
     return " ".join(text.split())
+
+
+def _culprit(error: BaseException) -> str:
+    """Return whose defect an unexpected error is: a person's own method's, else pgdm's."""
+    ours = Path(__file__).resolve().parents[1], Path(sys.prefix), Path(sys.base_prefix)
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename).resolve()
+        if path.is_file() and not any(path.is_relative_to(place) for place in ours):
+            return f"in {path}, line {frame.lineno}; --debug shows how it came there"
+    return "a defect of pgdm: please report it with what --debug shows"
 
 
 def _os_message(error: OSError) -> str:

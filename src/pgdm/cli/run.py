@@ -45,7 +45,7 @@ def _main(flags: Flags, command: str, debug: bool) -> int:
     from pgdm.cli.plan import run_planned
     from pgdm.cli.train import show, train
     from pgdm.config.store import from_dict_config
-    from pgdm.experiment import check_startable
+    from pgdm.experiment import foreseen
     from pgdm.library import open_library
 
     set_up_logging(debug)
@@ -53,8 +53,7 @@ def _main(flags: Flags, command: str, debug: bool) -> int:
         return run_planned(composed, default_name(typed, study), command)
     cfg = from_dict_config(composed.jobs[0][1])
     if "--dry-run" in flags.ours:
-        show(cfg)
-        check_startable(cfg, open_library())
+        show(cfg, foreseen(cfg, open_library()))
         return 0
     return train(cfg)
 

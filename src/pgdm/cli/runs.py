@@ -31,6 +31,7 @@ _COLUMNS = {
     "method": ("method", None),
     "algo": ("algo", None),
     "action": ("action", None),
+    "start": ("start", None),
     "seed": ("seed", "d"),
     "frames": ("frames", ",d"),
     "success": ("success", ".1%"),
@@ -110,6 +111,9 @@ def row(folder: RunFolder, root: Path) -> dict[str, Any]:
     named = ("success", "com_error_released", "lifted")
     return {
         **{key: tags.get(key) for key in ("task", "hand", "method", "algo", "action")},
+        # What the run itself found where it was asked for, else what was asked for.
+        "start": tags.get("pregrasp_used", tags.get("pregrasp_source")),
+        "ablation": tags.get("ablation"),
         "seed": folder.setting("seed"),
         "frames": folder.result.get("frames", last.get("frames")),
         **{name: _finite(metrics.get(f"eval_sampled/{name}")) for name in named},
@@ -126,6 +130,8 @@ def _table(rows: list[dict[str, Any]]) -> Table:
         table.add_column(name, justify="right" if form else "left", overflow="fold")
     for values in rows:
         shown = {**values, "when": _ago(time.time() - values["modified"])}
+        if values.get("ablation") not in (None, "none"):
+            shown["start"] = f"{values['start']} {values['ablation']}"
         cells = [_cell(shown.get(key), form) for key, form in _COLUMNS.values()]
         status = list(_COLUMNS).index("status")
         colour = _COLOURS.get(values["status"], "red")

@@ -16,8 +16,7 @@ A weight with a schedule: train/weight/NAME."""
 
 def term_table(cfg: ExperimentCfg) -> Table:
     """Return the table of the terms that are active in an experiment."""
-    title = f"{cfg.method.name}: {cfg.task.id}, pregrasp {cfg.pregrasp.source}"
-    table = Table(box=None, title=title, title_justify="left")
+    table = Table(box=None)
     for head in ("kind", "name", "weight"):
         table.add_column(head, no_wrap=True)
     for row in recipe(cfg.method).table():
@@ -25,9 +24,19 @@ def term_table(cfg: ExperimentCfg) -> Table:
     return table
 
 
+def setting_line(cfg: ExperimentCfg) -> str:
+    """Return what a run is of, on one line."""
+    start = cfg.pregrasp.source
+    if cfg.ablation.changes_start:
+        start += f", ablation {cfg.ablation.name}"
+    learner = f"{cfg.algo.name}, {cfg.action.kind} actions, seed {cfg.seed}"
+    made = f"method {cfg.method.name}, hand {cfg.hand.name}, pregrasp {start}"
+    return f"{cfg.task.id}: {made}, {learner}"
+
+
 def term_line(cfg: ExperimentCfg) -> str:
     """Return the same in a sentence, measures left out."""
     rows = recipe(cfg.method).table()
     rewards = ", ".join(f"{name} {weight}" for kind, name, weight in rows if kind == "reward")
     ends = ", ".join(name for kind, name, _ in rows if kind == "end")
-    return f"method {cfg.method.name}: rewards {rewards}; ends {ends}"
+    return f"rewards {rewards}; ends {ends}"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 
 from rich.console import Console
 
 from pgdm.cli.errors import report
 from pgdm.cli.progress import ProgressView
 from pgdm.cli.summary import summary_table
-from pgdm.cli.terms import RECORDED_AS, term_line, term_table
+from pgdm.cli.terms import RECORDED_AS, setting_line, term_line, term_table
 from pgdm.config.schema import ExperimentCfg
 from pgdm.experiment import RunResult, run_experiment
 from pgdm.stop import StopRequest
@@ -22,10 +23,13 @@ def notify(text: str) -> None:
     _PROGRESS.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def show(cfg: ExperimentCfg) -> None:
-    """Print what a run would be made of, and start nothing."""
+def show(cfg: ExperimentCfg, notes: Sequence[str]) -> None:
+    """Print what a run would be made of and what is to be said of it, and start nothing."""
+    print(setting_line(cfg))
     Console().print(term_table(cfg))
     print(RECORDED_AS)
+    for note in notes:
+        print(f"note:   {note}")
     print(f"run:    {cfg.run_dir} (nothing was started)")
 
 
@@ -42,6 +46,7 @@ def train(cfg: ExperimentCfg, patient: bool = False) -> int:
         PgdmError: if the run fails.
     """
     view = ProgressView(cfg.task.id, _PROGRESS)
+    notify(setting_line(cfg))
     notify(term_line(cfg))
     with StopRequest(patient) as stop:
         try:

@@ -87,7 +87,8 @@ def view_expert(task: str, video: Path | None, offline: bool) -> None:
 
         show_motion(scene.model, qpos, marks)
         return
-    _say(video, film_expert(scene, qpos, marks, reference, video))
+    title = "expert hand, rebuilt: approximate" if expert.approximate else "expert hand"
+    _say(video, film_expert(scene, qpos, marks, reference, title, video))
 
 
 def _check(video: Path | None) -> None:

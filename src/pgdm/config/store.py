@@ -216,6 +216,11 @@ def _explain_text(text: str, overrides: Sequence[str], config_dir: str | None) -
         return ConfigError("an experiment is added with a plus: +experiment=NAME")
     if wrong:
         names = _known_names(overrides, config_dir)
+        if wrong[1] in names:
+            section = wrong[1].rpartition(".")[0]
+            return ConfigError(f"'{wrong[1]}' cannot be set, as {section} is null here")
+        if having := _methods_with(wrong[1], config_dir):
+            return ConfigError(f"'{wrong[1]}' is a setting of method={' or '.join(having)} only")
         return UnknownNameError("key", wrong[1], names, "(pgdm-run --help lists them)")
     return ConfigError(text)
 
@@ -247,5 +252,17 @@ def _known_names(overrides: Sequence[str], config_dir: str | None) -> list[str]:
     """Return all keys of the experiment with the method that was chosen, dotted, and all groups."""
     methods = [f"method={name}" for name in available("method", config_dir)]
     chosen = [override for override in overrides if override in methods]
-    plain: Any = OmegaConf.to_container(_composed(chosen, config_dir), resolve=False)
-    return sorted({*flatten(plain), *groups(config_dir)})
+    return sorted({*_keys(chosen, config_dir), *groups(config_dir)})
+
+
+def _methods_with(key: str, config_dir: str | None) -> list[str]:
+    """Return the methods that have a key."""
+    if not key.startswith("method."):
+        return []
+    names = available("method", config_dir)
+    return [name for name in names if key in _keys([f"method={name}"], config_dir)]
+
+
+def _keys(overrides: Sequence[str], config_dir: str | None) -> list[str]:
+    plain: Any = OmegaConf.to_container(_composed(overrides, config_dir), resolve=False)
+    return list(flatten(plain))

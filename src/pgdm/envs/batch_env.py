@@ -84,6 +84,7 @@ class BatchEnv:
         self._start = self._read_start()
         self._obs = self.reset()
         self.obs_dim = self._obs.shape[1]
+        mdp.recipe.check(self._context(sim.read()))
 
     @property
     def t(self) -> Tensor:

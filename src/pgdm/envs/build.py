@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -50,7 +52,7 @@ class EnvBuilder:
     def __init__(self, library: Library, cfg: EnvCfg, recipe: Recipe) -> None:
         self.scene: Scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
         self.motion = library.motion(cfg.task.motion)
-        self._wanted = cfg.pregrasp.source
+        self._cfg = cfg
         start = start_state(cfg.pregrasp, self.motion, self.scene)
         self.ablated = None
         if cfg.ablation.changes_start:
@@ -73,12 +75,16 @@ class EnvBuilder:
         """Sentences that say what differs from what was asked for, or from other tasks."""
         task, used = self.scene.task.id, self.mdp.start.source
         notes = []
-        if used != self._wanted:
+        if used != (wanted := self._cfg.pregrasp.source):
             notes.append(
-                f"{task} has no start '{self._wanted}' in the assets of "
+                f"{task} has no start '{wanted}' in the assets of "
                 f"{self.scene.asset_source}; starting from '{used}' ('pgdm pregrasp reach {task}' "
                 "plans one)"
             )
+        if self.ablated is not None:
+            ablation = self._cfg.ablation
+            if told := self.ablated.compromises(ablation.distance_m):
+                notes.append(f"ablation={ablation.name} of {task}: {told}")
         if self.expert is not None and self.expert.approximate:
             notes.append(
                 f"the expert hand trajectory of {task} is approximate: it was rebuilt from another "
@@ -109,7 +115,18 @@ class EnvBuilder:
             facts["pregrasp_sha256"] = self.mdp.start.sha256
         if self.ablated is not None:
             facts |= self.ablated.facts()
-        return facts if self.expert is None else facts | {"expert_sha256": self.expert.sha256}
+        if self.expert is not None:
+            facts["expert_sha256"] = self.expert.sha256
+            facts["expert_hand"] = (
+                "rebuilt, approximate" if self.expert.approximate else "published"
+            )
+        return facts
+
+    def differences(self, recorded: Mapping[str, Any]) -> Iterator[str]:
+        """Yield what of a run's recorded facts is not so here."""
+        for key, now in self.facts().items():
+            if recorded.get(key) != now:
+                yield f"{key} '{recorded.get(key)}', and the library now has '{now}'"
 
     def make(
         self,

@@ -106,6 +106,7 @@ def film_expert(
     qpos: np.ndarray,
     marks: Sequence[np.ndarray],
     reference: ObjectReference,
+    title: str,
     path: Path,
 ) -> Path:
     """Write an MP4 of hand and object moving as the expert's did; return its poster.
@@ -115,6 +116,7 @@ def film_expert(
         qpos: joint positions (T, nq) at the control steps.
         marks: where fingers touch the object at each of them, (n, 3) m each, world frame.
         reference: the object's motion, which the picture shows.
+        title: what is seen.
         path: of the MP4.
 
     Raises:
@@ -123,7 +125,7 @@ def film_expert(
     last = len(qpos) - 1
     with _renderer(scene, reference, _CLOSE_M) as renderer:
         frames = (
-            renderer.render_qpos(row, None, f"{scene.task.id}  expert hand  {t}/{last}", marks[t])
+            renderer.render_qpos(row, None, f"{scene.task.id}  {title}  {t}/{last}", marks[t])
             for t, row in enumerate(qpos)
         )
         return write_video(path, frames)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
+from pgdm.errors import ConfigError
 from pgdm.mdp.context import StepContext
 from pgdm.mdp.metrics import MetricsCfg
 
@@ -51,10 +52,47 @@ class Recipe:
     needs_expert: bool = False
     """Whether terms or measures compare with an expert's hand trajectory."""
 
+    def __post_init__(self) -> None:
+        """Check that terms can be told apart by their names.
+
+        Raises:
+            ConfigError: if not.
+        """
+        for terms in (self.rewards, self.ends, self.measures):
+            names = [term.name for term in terms]
+            twice = next((name for name in names if names.count(name) > 1), None)
+            if twice is not None:
+                raise ConfigError(
+                    f"a recipe has the {type(terms[0]).__name__} '{twice}' twice; give each its "
+                    "own name: under it, it is recorded"
+                )
+
     def comparing(self, measures: tuple[Measure, ...]) -> Recipe:
         """Return it with measures that compare with an expert, beside those it has."""
         new = tuple(measure for measure in measures if measure not in self.measures)
         return replace(self, measures=(*self.measures, *new), needs_expert=True)
+
+    def check(self, context: StepContext) -> None:
+        """Check that every term gives one value a simulation.
+
+        Raises:
+            ConfigError: at the first one that does not.
+        """
+        values = {f"reward '{term.name}'": term.value(context) for term in self.rewards}
+        values |= {f"end '{end.name}'": end.reached(context) for end in self.ends}
+        values |= {f"measure '{m.name}'": m.value(context) for m in self.measures}
+        for name, value in values.items():
+            if value.shape != context.t.shape:
+                raise ConfigError(
+                    f"the {name} of this method gives values of shape {tuple(value.shape)}; it "
+                    f"must be one a simulation, {tuple(context.t.shape)}"
+                )
+
+    def unfinished(self, frames: int) -> list[tuple[str, float, float]]:
+        """Return (name, weight, final weight) of rewards whose schedule outlasts so many frames."""
+        final = {term.name: term.weight for term in self.rewards}
+        last = {name: w for schedule in self.schedules for name, w in schedule(frames).items()}
+        return [(name, w, final[name]) for name, w in last.items() if w != final[name]]
 
     def table(self) -> list[tuple[str, str, str]]:
         """Return what is active as rows (kind, name, weight), for people to read."""

@@ -48,9 +48,14 @@ def _imported(name: str) -> Method:
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
+        found = error.name is None or not f"{module_name}.".startswith(f"{error.name}.")
+        cure = (
+            "mend it: the module is there, but not all that it imports"
+            if found
+            else "install its package, or name the folder it lies in with PYTHONPATH"
+        )
         raise ConfigError(
-            f"method.name '{name}': cannot import '{module_name}' ({error}); install its package, "
-            "or name the folder it lies in with PYTHONPATH"
+            f"method.name '{name}': cannot import '{module_name}' ({error}); {cure}"
         ) from error
     found = getattr(module, attribute, None)
     if not isinstance(found, Method):

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from pgdm.errors import ConfigError, SceneError, UnknownNameError
+from pgdm.pregrasp.ablated import Ablated
 from pgdm.pregrasp.sources import StartState
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.contact import HandContact
@@ -16,8 +17,6 @@ from pgdm.sim.scene import Scene
 
 FINGERS = ("keep", "open", "mean")
 
-FINGER_LENGTH_M = 0.1
-"""Turns a finger's error into one of its tip, to weigh it against a retreat of the wrist."""
 OBJECT_TOLERANCE_M = 0.005
 """By how much fingers that move to their pose may displace the object."""
 OVERLAP_M = 0.0015
@@ -72,40 +71,6 @@ class AblationCfg:
                 f"ablation={self.name} changes the pre-grasp, but pregrasp=none starts without "
                 "one: nothing is left to ablate; use ablation=none, or another pregrasp"
             )
-
-
-@dataclass(frozen=True)
-class Ablated:
-    """An ablated start, and how far it is from what the ablation asks for."""
-
-    start: StartState
-    distance_m: float
-    """How far the wrist is from its place in the pre-grasp."""
-    retreat_m: float
-    """What of it the ablation did not ask for: room that the hand needed."""
-    finger_error_rad: float
-    """Largest difference of a finger joint from the pose that was asked for."""
-    object_moved_m: float
-    """How far the object was pushed while the fingers moved in the simulation; it was put back."""
-    simulated: bool
-    """Whether the fingers were moved there in the simulation, or just set."""
-    depth_m: float
-    """Deepest penetration of the hand and anything else."""
-
-    @property
-    def deviation_m(self) -> float:
-        """Retreat of the wrist, and the fingers' error at their tips."""
-        return self.retreat_m + FINGER_LENGTH_M * self.finger_error_rad
-
-    def facts(self) -> dict[str, str]:
-        """Return what a run should tell of it."""
-        return {
-            "ablation_distance_mm": f"{1e3 * self.distance_m:.1f}",
-            "ablation_retreat_mm": f"{1e3 * self.retreat_m:.1f}",
-            "ablation_finger_error_rad": f"{self.finger_error_rad:.3f}",
-            "ablation_depth_mm": f"{1e3 * self.depth_m:.1f}",
-            "ablation_reached_by": "simulation" if self.simulated else "setting",
-        }
 
 
 def ablate(cfg: AblationCfg, start: StartState, scene: Scene, substeps: int) -> Ablated:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,8 @@ from pgdm.sim.scene import Scene
 
 PANEL = 640, 480  # pixels, width and height
 COLUMNS = 3
-_LABEL_HEIGHT, _TITLE_SIZE, _TEXT_SIZE, _MARGIN = 62, 22, 17, 10  # pixels
+_LABEL_HEIGHT, _TITLE_SIZE, _TEXT_SIZE, _MARGIN = 84, 22, 17, 10  # pixels
+_CHARACTERS = 72  # of the text that fit beside one another
 _PAPER, _INK, _GREY = (255, 255, 255), (20, 20, 20), (90, 90, 90)
 
 
@@ -26,7 +28,7 @@ class Panel:
     qpos: np.ndarray  # (nq,) m, rad
     title: str
     text: str
-    """A line of figures below the title."""
+    """Figures below the title, two lines at most."""
 
 
 def write_sheet(scene: Scene, panels: Sequence[Panel], path: Path) -> Path:
@@ -48,7 +50,8 @@ def write_sheet(scene: Scene, panels: Sequence[Panel], path: Path) -> Path:
             corner = x + _MARGIN, y + height + 6
             below = x + _MARGIN, y + height + 10 + _TITLE_SIZE
             draw.text(corner, panel.title, _INK, ImageFont.load_default(_TITLE_SIZE))
-            draw.text(below, panel.text, _GREY, ImageFont.load_default(_TEXT_SIZE))
+            text = textwrap.fill(panel.text, _CHARACTERS)
+            draw.text(below, text, _GREY, ImageFont.load_default(_TEXT_SIZE))
     return write_image(path, np.asarray(sheet))
 
 
