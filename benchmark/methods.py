@@ -173,12 +173,14 @@ def plot(found: Sequence[dict[str, Any]], tasks: Sequence[str], path: Path) -> N
             axis.set_ylabel(label if column == 0 else "")
             for run in (run for run in found if run["task"] == task and name in run[kind]):
                 color = f"C{names.index(run['setting'])}"
-                axis.plot(run[kind]["frames"], run[kind][name], color, label=run["setting"])
-            axis.set_ylim(bottom=0)
+                frames = [count / 1000 for count in run[kind]["frames"]]
+                axis.plot(frames, run[kind][name], color, label=run["setting"])
+            axis.set_ylim(0, 1 if label == "lifted" else None)
+        axes[-1][column].set_xlabel("thousand frames")
     handles = {h.get_label(): h for a in axes.flat for h in a.get_lines()}
     if handles:
         figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=3)
-    figure.suptitle("One seed, ppo_fast, residual actions")
+    figure.suptitle("One seed, ppo_fast, residual actions; means of 25 sampled episodes")
     figure.tight_layout(rect=(0, 0.06, 1, 1))
     figure.savefig(path, dpi=80)
 

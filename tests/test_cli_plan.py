@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from command_line import TINY, Outcome, command
+from pgdm.config.store import compose
+from pgdm.library import Library, Motion, open_library
+from pgdm.sweep.foresee import foresee
 from pgdm.sweep.plan import Plan, read_plan, record
 
 SMALL = ("-m", "--dry-run", "budget=smoke")
@@ -148,6 +152,48 @@ def test_what_is_finished_is_counted(library_home: Path) -> None:
     assert rows["jobs"] == "2 (1 finished, 0 begun)"
     assert rows["frames"] == "32 a job, 64 in all, 32 to do"
     assert "measured in 1 earlier runs" in rows["time"]
+
+
+def test_a_start_that_no_run_would_find_refuses_the_sweep(library_home: Path) -> None:
+    line = ["-m", "task=cup-pour1,duck-lift", "pregrasp=teleop", "--dry-run"]
+    outcome = command("pgdm-run", *line)
+    assert outcome.code == 2 and "'cup-pour1' has no stored start 'teleop'" in outcome.err
+
+
+class Bare(Library):
+    """The library, in which one task has no plan and another is missing, as in the package."""
+
+    def motion(self, motion_id: str, source: str | None = None) -> Motion:
+        """Return a motion; the cup's has its mined start only."""
+        found = super().motion(motion_id, source)
+        mined = {"mined": found.starts["mined"]}
+        return replace(found, starts=mined) if motion_id == "cup-pour1" else found
+
+    def tasks(self) -> dict[str, str]:
+        """Return all tasks but the door."""
+        return {task: source for task, source in super().tasks().items() if task != "door-open"}
+
+
+@pytest.mark.usefixtures("library_home")
+def test_what_the_assets_here_have_not_is_told() -> None:
+    whole = open_library()
+    folders = {source: whole.folder(source) for source in whole.sources()}
+    library = Bare(whole.root, whole.sources(), folders)
+    cfgs = [
+        compose([f"task={task}", f"pregrasp={start}", f"method={method}"])
+        for task, start, method in (
+            *[("cup-pour1", "planned", "pgdm")] * 2,
+            ("cup-pour1", "mined", "pgdm"),
+            ("cup-pour1", "none", "pgdm"),
+            ("duck-lift", "planned", "graff"),
+            ("piggybank-use1", "planned", "graff"),
+            ("door-open", "planned", "pgdm"),
+        )
+    ]
+    start, lacking, approximate = foresee(cfgs, library)
+    assert start.startswith("2 runs with pregrasp=planned start from 'mined'")
+    assert lacking.endswith("here: door-open")
+    assert approximate.endswith("approximate: piggybank-use1")
 
 
 def test_the_plugin_loads_nothing_heavy() -> None:

@@ -13,7 +13,9 @@ from pgdm.cli.compose import Composed
 from pgdm.cli.train import notify
 from pgdm.config.strict import build
 from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.library import open_library
 from pgdm.sweep.estimate import Estimate, estimate
+from pgdm.sweep.foresee import foresee
 from pgdm.sweep.launch import run_sweep
 from pgdm.sweep.plan import LAUNCHERS, LauncherCfg, LocalCfg, Plan, SweepCfg, check_fits
 from pgdm.sweep.planning import make_plan
@@ -38,6 +40,8 @@ def run_planned(composed: Composed, name: str, command: str) -> int:
     plan, notes = make_plan(composed.jobs, sweep, name, command)
     check_fits(plan)
     for note in [*notes[:_MOST_NOTES], *(["..."] if len(notes) > _MOST_NOTES else [])]:
+        notify(f"note: {note}")
+    for note in foresee((job.cfg for job in plan.jobs), open_library()):
         notify(f"note: {note}")
     _show(plan, estimate(plan, paths.runs()))
     if sweep.dry_run:

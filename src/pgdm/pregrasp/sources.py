@@ -84,6 +84,16 @@ def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
     )
 
 
+def stored_source(cfg: PregraspCfg, motion: Motion, task: str, hand: str) -> str | None:
+    """Return the source or its fallback, whichever is stored first; None if neither is."""
+    for source in (cfg.source, cfg.fallback):
+        if source is not None and (
+            source in motion.starts or pregrasp_file.path_of(task, hand, source).is_file()
+        ):
+            return source
+    return None
+
+
 def _stored(source: str, motion: Motion, scene: Scene) -> StartState | None:
     """Return the user's own start of a source, else the one stored with the motion, else None."""
     task, hand = scene.task.id, scene.hand.name
