@@ -13,7 +13,8 @@ from pgdm.report.results import Results
 from pgdm.report.runs import METRICS, RETURN
 from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
-from pgdm.report.tables import THRESHOLDS, Average, Improvement, TaskRow
+from pgdm.report.tables import THRESHOLDS, Average, Improvement
+from pgdm.report.task_table import TaskRow
 
 FILES = (
     "runs.csv",

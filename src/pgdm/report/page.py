@@ -25,6 +25,7 @@ from pgdm.report.runs import ERROR, SUCCESS
 from pgdm.report.settings import shared
 from pgdm.report.source import Found, Progress, find
 from pgdm.report.statistics import DRAWS, Estimate
+from pgdm.report.task_table import task_rows
 
 PAGE = "report.html"
 _NONE = "-"
@@ -65,7 +66,7 @@ def write_report(
 def _context(
     results: Results, found: Found, places: Sequence[str], out: Path, progress: Progress
 ) -> dict[str, Any]:
-    by_task = {setting: tables.task_rows(results, setting) for setting in results.settings}
+    by_task = {setting: task_rows(results, setting) for setting in results.settings}
     progress("computing statistics", 0, 1)
     averages = {
         "source": tables.by_source(results),

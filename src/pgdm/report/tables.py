@@ -1,4 +1,4 @@
-"""The report's tables: by task, and averages set beside those of the paper."""
+"""The report's tables of averages, set beside those of the paper."""
 
 from __future__ import annotations
 
@@ -11,47 +11,13 @@ import numpy as np
 
 from pgdm.report import statistics
 from pgdm.report.results import Results, average, known, paper
-from pgdm.report.runs import ERROR, LIFTED, ROTATION, SUCCESS, SUCCESS_MEAN, Run
+from pgdm.report.runs import ERROR, ROTATION, SUCCESS, Run
 from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
 
 NOTHING = Estimate(np.nan, np.nan, np.nan)
 THRESHOLDS = np.linspace(0.0, 1.0, 51)
 """Of the performance profile, in success."""
-
-
-@dataclass(frozen=True)
-class TaskRow:
-    """One setting on one task; means over the seeds that finished."""
-
-    setting: Setting
-    task: str
-    source: str
-    """Where the task's pre-grasp came from."""
-    seeds: dict[int, str]
-    """Seed to state."""
-    frames: int
-    """Fewest environment steps of a finished run; 0 if none has finished."""
-    success: float
-    success_mean_action: float
-    error: float
-    lifted: float
-    paper_success: float
-    paper_error: float
-    null: float
-    """Success if the object never moves."""
-    comparable: bool
-    """Whether the paper's figures were made the same way."""
-
-    @property
-    def difference(self) -> float:
-        """Success less the paper's."""
-        return self.success - self.paper_success
-
-    @property
-    def done(self) -> int:
-        """How many seeds have finished."""
-        return sum(state == "finished" for state in self.seeds.values())
 
 
 @dataclass(frozen=True)
@@ -101,39 +67,6 @@ class Improvement(NamedTuple):
     def won(self) -> float:
         """Tasks on which the setting is better, ties as halves, if it is ``single``."""
         return self.chance.value * self.tasks
-
-
-def task_rows(results: Results, setting: Setting) -> list[TaskRow]:
-    """Return the table of one setting, a row a task."""
-    rows = []
-    comparable = not results.deviations(setting)
-    for task in results.tasks:
-        runs = results.cell(setting, task)
-        if not runs:
-            continue
-        done = [run for run in runs if run.finished]
-
-        def mean(metric: str, done: list[Run] = done) -> float:
-            return average(run.metric(metric) for run in done)
-
-        rows.append(
-            TaskRow(
-                setting=setting,
-                task=task,
-                source=str(runs[0].facts.get("pregrasp_source", "?")),
-                seeds=results.states(setting, task),
-                frames=min((run.frames for run in done), default=0),
-                success=mean(SUCCESS),
-                success_mean_action=mean(SUCCESS_MEAN),
-                error=mean(ERROR),
-                lifted=mean(LIFTED),
-                paper_success=known(runs[0], "paper_success"),
-                paper_error=known(runs[0], "paper_com_error"),
-                null=paper()["null_policy"].get(task, np.nan),
-                comparable=comparable,
-            )
-        )
-    return rows
 
 
 def by_source(results: Results) -> list[Average]:
