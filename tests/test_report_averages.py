@@ -56,7 +56,15 @@ def test_rows_of_different_tasks_do_not_compare(tmp_path: Path) -> None:
     make(tmp_path / "runs" / "none", 0.1, "task=cup-pour1", "pregrasp=none")
     assert said not in text_of(report(tmp_path / "runs"))
     make(tmp_path / "runs" / "hammer", 0.7, "task=hammer-use1")
-    assert text_of(report(tmp_path / "runs")).count(said) == 1
+    text = text_of(report(tmp_path / "runs"))
+    assert text.count(said) == 1
+    assert "share no task" not in text
+    apart = tmp_path / "apart"
+    make(apart / "cup", 0.7, "task=cup-pour1")
+    make(apart / "none", 0.1, "task=hammer-use1", "pregrasp=none")
+    text = text_of(report(apart, out=apart / "out"))
+    assert f"{said} They share no task and so have no curve." in text
+    assert not (apart / "out" / "baselines_curves.png").exists()
 
 
 def test_one_run_a_task_is_counted_and_no_probability(tmp_path: Path) -> None:

@@ -91,6 +91,7 @@ def _context(
         "deviations": {s: results.deviations(s) for s in results.settings},
         "colours": {s: figures.colour(results, s) for s in results.settings},
         "averages": averages,
+        "apart": {t: mean_curves.apart(results, averages[t]) for t in ("ablation", "baseline")},
         "by_task": by_task,
         "aggregates": aggregates,
         "better": better,

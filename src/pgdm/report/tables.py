@@ -16,6 +16,7 @@ from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
 
 NOTHING = Estimate(np.nan, np.nan, np.nan)
+_WITH, _WITHOUT = " with pre-grasp", " without pre-grasp"
 THRESHOLDS = np.linspace(0.0, 1.0, 51)
 """Of the performance profile, in success."""
 
@@ -46,6 +47,11 @@ class Average:
     """The paper's own average: ``success``, ``com_error``, and ``tasks`` where it says so."""
     deviations: tuple[str, ...] = ()
     """Why it cannot be set against the paper's."""
+
+    @property
+    def hue(self) -> str:
+        """What has one hue in all groups: its name, whether with or without pre-grasps."""
+        return self.name.replace(_WITHOUT, _WITH)
 
 
 class Improvement(NamedTuple):
@@ -106,7 +112,7 @@ def baselines(results: Results) -> list[Average]:
     rows = []
     for setting, same in kinds.items():
         figures = paper()["by_ablation"]["none"] if setting.plain else {}
-        name = f"{setting.method} {'with' if setting.with_pregrasp else 'without'} pre-grasp"
+        name = setting.method + (_WITH if setting.with_pregrasp else _WITHOUT)
         name += _values(setting, "method")
         name += "".join(f", {c}" for c in setting.within("pregrasp") if c != "pregrasp=none")
         args = results, "baseline", setting, name, groups[setting], figures, _in_tcdm30
