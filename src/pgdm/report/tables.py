@@ -44,7 +44,8 @@ class Average:
     """The paper's figures of the same tasks, averaged: ``success`` and ``com_error``; NaN where
     the row is not what they are of, PGDM as it stands."""
     paper: dict[str, float] = field(default_factory=dict)
-    """The paper's own average: ``success``, ``com_error``, and ``tasks`` where it says so."""
+    """The paper's own average: ``success``, ``com_error``, and ``tasks`` where it says so; empty
+    where the row is none of the paper's: another method's ablation, other values, another hand."""
     deviations: tuple[str, ...] = ()
     """Why it cannot be set against the paper's."""
 
@@ -94,10 +95,10 @@ def by_ablation(results: Results) -> list[Average]:
     groups = _groups(shown, "ablation")
     rows = []
     for setting in shown:
-        name = setting.option("ablation")
-        figures = paper()["by_ablation"].get(name, {})
-        name += _values(setting, "ablation")
-        args = results, "ablation", setting, name, groups[setting], figures, _in_tcdm30
+        name, values = setting.option("ablation"), _values(setting, "ablation")
+        own = setting.method == "pgdm" and not values
+        figures = paper()["by_ablation"].get(name, {}) if own else {}
+        args = results, "ablation", setting, name + values, groups[setting], figures, _in_tcdm30
         rows += _average(*args, "ablation")
     return rows
 
@@ -190,7 +191,8 @@ def _average(
 
     def stated(figure: str) -> float:
         first = [results.cell(setting, task)[0] for task in scores]
-        return average(known(run, figure) for run in first) if setting.plain else np.nan
+        own = setting.plain and setting.own_hand
+        return average(known(run, figure) for run in first) if own else np.nan
 
     yield Average(
         table=table,
@@ -204,7 +206,7 @@ def _average(
         error=estimate(ERROR),
         rotation=estimate(ROTATION),
         same={"success": stated("paper_success"), "com_error": stated("paper_com_error")},
-        paper=figures,
+        paper=figures if setting.own_hand else {},
         deviations=tuple(results.deviations(setting, *same)),
     )
 
