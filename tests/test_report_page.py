@@ -64,8 +64,12 @@ def test_what_the_page_says(page: Path) -> None:
 
 
 def test_no_better_than_doing_nothing_is_red(page: Path) -> None:
-    found = re.findall(r'<th>([a-z0-9-]+)</th>\s*<td class="bad"><b>', page.read_text())
+    text = page.read_text()
+    found = re.findall(r'<th>([a-z0-9-]+)</th>\s*<td class="bad"><b>', text)
     assert found == ["toothbrush-lift"]  # 30% where nothing gives 45%; failed runs have no number
+    overview = text[text.index('id="overview"') : text.index('id="source"')]
+    assert re.findall(r'<b class="bad">(.*?)</b>', overview) == ["30.0%"]
+    assert re.findall(r'<b class="">(.*?)</b>', overview) == ["60.0%", "10.0%", "80.0%"]
 
 
 def test_all_files_are_there_and_pictures_are_whole(page: Path) -> None:

@@ -40,6 +40,11 @@ class TaskRow:
         return self.success - self.paper_success
 
     @property
+    def idle(self) -> bool:
+        """Whether doing nothing is as good."""
+        return self.success <= self.null
+
+    @property
     def done(self) -> int:
         """How many seeds have finished."""
         return sum(state == "finished" for state in self.seeds.values())
