@@ -14,6 +14,7 @@ from pgdm.report import figures, mean_curves, tables
 from pgdm.report.results import Results
 from pgdm.report.runs import ERROR, SUCCESS
 from pgdm.report.settings import Setting, setting_of
+from pgdm.report.statistics import Estimate
 from report_runs import curve_run
 
 STEEP = {0: 0.0, 10: 0.2, 20: 0.4, 40: 0.8}
@@ -245,3 +246,14 @@ def test_pregrasps_of_two_sources_have_names_and_hues_of_their_own() -> None:
     ]
     planned, mined, none = figures.shades(rows).values()
     assert planned[:3] == none[:3] != mined[:3]
+
+
+def test_the_axis_of_interquartile_means_has_only_what_success_can_be() -> None:
+    made = setting()
+    results = Results([curve_run(made, "a", STEEP)])
+    for value, low, high in ((0.01, 0.0, 0.6), (0.0, np.nan, np.nan), (0.9, 0.4, 1.0)):
+        figure = figures.intervals(results, {made: Estimate(value, low, high)}, "mean")
+        left, right = figure.axes[0].get_xlim()
+        assert 0.0 <= left <= value <= right <= 1.0
+    low_end = figures.intervals(results, {made: Estimate(0.01, 0.0, 0.6)}, "mean").axes[0]
+    assert low_end.get_xlim()[0] == 0.0

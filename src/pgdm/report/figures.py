@@ -45,12 +45,14 @@ def colour(results: Results, setting: Setting) -> str:
 
 
 def intervals(results: Results, estimates: dict[Setting, Estimate], name: str) -> Figure:
-    """Draw one estimate a setting, with its interval."""
+    """Draw one estimate of success a setting, with its interval."""
     figure, axes = _rows([results.labels[setting] for setting in estimates])
     for row, (setting, (value, low, high)) in enumerate(estimates.items()):
         shade = colour(results, setting)
         axes.plot([low, high], [row, row], color=shade, lw=6, alpha=0.35)
-        axes.plot([value], [row], "o", color=shade, ms=5)
+        axes.plot([value], [row], "o", color=shade, ms=5, clip_on=False)
+    low, high = axes.get_xlim()
+    axes.set_xlim(max(low, 0.0), min(high, 1.0))  # no success lies beyond
     axes.set_xlabel(name, fontsize=9)
     return figure
 
