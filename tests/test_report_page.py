@@ -72,6 +72,14 @@ def test_no_better_than_doing_nothing_is_red(page: Path) -> None:
     assert re.findall(r'<b class="">(.*?)</b>', overview) == ["60.0%", "10.0%", "80.0%"]
 
 
+def test_exactly_as_good_as_doing_nothing_is_no_better(tmp_path: Path) -> None:
+    make(tmp_path / "runs" / "a", 1 / 19, "task=spheremedium-lift")  # nothing has 1 of 19 steps
+    make(tmp_path / "runs" / "b", 0.0527, "task=spheremedium-lift", "pregrasp=none")
+    text = report(tmp_path / "runs")
+    assert re.findall(r'class="bad">(?:<b>)?(5.3%)', text) == ["5.3%"] * 2  # in both tables
+    assert text.count("5.3%") > 4
+
+
 def test_all_files_are_there_and_pictures_are_whole(page: Path) -> None:
     assert sorted(p.stem for p in page.parent.glob("*.csv")) == CSVS
     pictures = sorted(page.parent.glob("*.png"))

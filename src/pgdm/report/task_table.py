@@ -41,8 +41,8 @@ class TaskRow:
 
     @property
     def idle(self) -> bool:
-        """Whether doing nothing is as good."""
-        return self.success <= self.null
+        """Whether doing nothing is as good; its success is known to four digits."""
+        return round(self.success, 4) <= self.null
 
     @property
     def done(self) -> int:
