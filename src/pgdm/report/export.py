@@ -61,13 +61,15 @@ def runs(results: Results, out: Path) -> None:
 def tasks(results: Results, rows: Iterable[TaskRow], out: Path) -> None:
     """Write ``tasks.csv``: the table by task."""
     head = ["task", "setting", "pregrasp_source", "seeds_finished", "seeds", "frames", "success"]
-    head += ["success_mean_action", "com_error_released", "lifted", "paper_success"]
-    head += ["paper_com_error", "difference", "null_success", "comparable_with_paper"]
+    head += ["success_mean_action", "com_error_released", "lifted", "hand_error_m"]
+    head += ["contact_distance_m", "paper_success", "paper_com_error", "difference"]
+    head += ["null_success", "comparable_with_paper"]
     table = [
         [
             *(row.task, results.labels[row.setting], row.source, row.done),
             " ".join(f"{seed}:{state}" for seed, state in row.seeds.items()),
             *(row.frames, row.success, row.success_mean_action, row.error, row.lifted),
+            *(row.fingertips, row.contacts),
             *(row.paper_success, row.paper_error, row.difference, row.null),
             "yes" if row.comparable else "no",
         ]

@@ -200,6 +200,7 @@ def _render(context: dict[str, Any]) -> str:
         "percent": lambda value, digits=1: _shown(value, f".{digits}%"),
         "points": lambda value: _shown(100 * value, "+.1f"),
         "metres": lambda value: _shown(value, ".2e"),
+        "centimetres": lambda value: _shown(100 * value, ".1f"),
         "radians": lambda value: _shown(value, ".2f"),
         "between": _between,
         "frames": _frames,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pgdm.report.results import Results, average, known, paper
-from pgdm.report.runs import ERROR, LIFTED, SUCCESS, SUCCESS_MEAN, Run
+from pgdm.report.runs import CONTACTS, ERROR, FINGERTIPS, LIFTED, SUCCESS, SUCCESS_MEAN, Run
 from pgdm.report.settings import Setting
 
 
@@ -27,6 +27,10 @@ class TaskRow:
     success_mean_action: float
     error: float
     lifted: float
+    fingertips: float
+    """Their mean distance from the expert's, m; NaN where no run recorded it."""
+    contacts: float
+    """That from its contact points."""
     paper_success: float
     paper_error: float
     null: float
@@ -38,6 +42,11 @@ class TaskRow:
     def difference(self) -> float:
         """Success less the paper's."""
         return self.success - self.paper_success
+
+    @property
+    def follows(self) -> bool:
+        """Whether it is known how far the hand was from the expert's."""
+        return bool(np.isfinite([self.fingertips, self.contacts]).any())
 
     @property
     def idle(self) -> bool:
@@ -74,6 +83,8 @@ def task_rows(results: Results, setting: Setting) -> list[TaskRow]:
                 success_mean_action=mean(SUCCESS_MEAN),
                 error=mean(ERROR),
                 lifted=mean(LIFTED),
+                fingertips=mean(FINGERTIPS),
+                contacts=mean(CONTACTS),
                 paper_success=known(runs[0], "paper_success"),
                 paper_error=known(runs[0], "paper_com_error"),
                 null=paper()["null_policy"].get(task, np.nan),
