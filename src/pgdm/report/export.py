@@ -25,13 +25,16 @@ FILES = (
     "curves.csv",
 )
 
-ABLATION = (
+FACTS = (
+    "asset_source",
+    "wall_time_s",
+    "git",
     "ablation_distance_mm",
     "ablation_retreat_mm",
     "ablation_finger_error_rad",
     "ablation_depth_mm",
 )
-"""What a run tells of its ablated start; empty without an ablation."""
+"""What a run tells of itself, of its ablated start only with an ablation."""
 
 Aggregates = dict[Setting, tuple[Estimate, list[Estimate], int, int]]
 Improvements = dict[tuple[Setting, Setting], Improvement]
@@ -45,7 +48,7 @@ def runs(results: Results, out: Path) -> None:
             *(run.task, results.labels[run.setting], run.seed, run.state),
             *("yes" if run.finished else "no", run.frames, run.setting.total_frames, run.budget),
             run.start,
-            *(run.result.get(fact, "") for fact in ("wall_time_s", "git", *ABLATION)),
+            *(run.result.get(fact, "") for fact in FACTS),
             *(run.metric(name) for name in METRICS),
             os.path.relpath(run.path, out.absolute()),
         ]
@@ -53,7 +56,7 @@ def runs(results: Results, out: Path) -> None:
     ]
     _write(
         out / "runs.csv",
-        [*head, "start", "wall_time_s", "git", *ABLATION, *METRICS, "folder"],
+        [*head, "start", *FACTS, *METRICS, "folder"],
         rows,
     )
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from pgdm.config.store import PAPER_FRAMES
 from pgdm.errors import RunError
-from pgdm.report import export, figures, mean_curves, tables
+from pgdm.report import alike, export, figures, mean_curves, tables
 from pgdm.report.curves import curves
 from pgdm.report.results import Results, paper
 from pgdm.report.runs import ERROR, SUCCESS
@@ -86,6 +86,8 @@ def _context(
         "places": places,
         "now": time.strftime("%Y-%m-%d %H:%M"),
         "counts": results.counts(),
+        "mixed": alike.mixed(results),
+        "doubles": alike.left_out(results),
         "budgets": Counter(run.budget for run in results.runs),
         "shared": shared(results.settings),
         "deviations": {s: results.deviations(s) for s in results.settings},
@@ -102,7 +104,10 @@ def _context(
         "commands": _commands(results),
         "typed": found.commands,
         "unreadable": found.unreadable,
-        "folders": {run.path: os.path.relpath(run.path, out.absolute()) for run in results.runs},
+        "folders": {
+            run.path: os.path.relpath(run.path, out.absolute())
+            for run in (*results.runs, *results.doubles)
+        },
         "paper_frames": PAPER_FRAMES,
         "draws": DRAWS,
         "files": [*export.FILES, *(f"{name}.png" for name in pictures)],
@@ -167,6 +172,7 @@ def _provenance(results: Results) -> list[tuple[str, list[tuple[str, int]]]]:
             "git revision": run.result.get("git"),
             "assets": run.result.get("asset_source"),
             "start": run.result.get("pregrasp_used"),
+            "expert hand": run.result.get("expert_hand"),
             **run.result.get("versions", {}),
         }
         for name, value in of_run.items():
