@@ -24,7 +24,12 @@ FRAMES = 40_960
 
 
 def make(
-    path: Path, success: float, *overrides: str, state: str = "finished", **changes: Any
+    path: Path,
+    success: float,
+    *overrides: str,
+    state: str = "finished",
+    told: Mapping[str, Any] | None = None,
+    **changes: Any,
 ) -> RunFolder:
     """Write a run whose last evaluation has a success, sampled; the mean action has 0.1 more.
 
@@ -33,6 +38,7 @@ def make(
         success: of the last of four evaluations; the first has none.
         overrides: settings, as for ``pgdm-run``; the task must be one of them.
         state: what ``result.json`` says; ``running`` has none.
+        told: what ``result.json`` says besides, or instead.
         changes: of top-level keys, whatever ``conf/`` knows of them.
     """
     config = compose_plain([f"total_frames={FRAMES}", "budget=smoke", *overrides]) | changes
@@ -52,7 +58,7 @@ def make(
     result |= {"pregrasp_used": config["pregrasp"]["source"], "versions": {"mujoco": "4.0.0"}}
     result |= {"error": "the disk is full"} if state == "failed" else {}
     if state != "running":
-        (path / "result.json").write_text(json.dumps(result))
+        (path / "result.json").write_text(json.dumps(result | dict(told or {})))
     return RunFolder(path)
 
 

@@ -156,7 +156,8 @@ def test_settings_are_in_sdist_and_wheel(built: tuple[Path, Path]) -> None:
     assert {Path("pgdm") / path for path in own} <= names
     assert Path("pgdm/conf/__init__.py") in names
     assert Path("pgdm/py.typed") in names
-    assert {Path("pgdm/report/page.html"), Path("pgdm/report/paper.yaml")} <= names
+    beside = ("page.html", "page.css", "paper.yaml")
+    assert {Path("pgdm/report") / name for name in beside} <= names
     assert Path("hydra_plugins/pgdm_sweeper/sweeper.py") in names
     assert Path("hydra_plugins/__init__.py") not in names  # other packages have plugins there too
 

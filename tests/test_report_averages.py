@@ -26,6 +26,44 @@ def test_ablations_stand_beside_the_papers(tmp_path: Path) -> None:
     ]
 
 
+def test_rows_that_are_not_the_papers_have_none_of_its_figures(tmp_path: Path) -> None:
+    own = {
+        "plain": (),
+        "near": ("ablation=distance_15cm", "ablation.distance_m=0.05"),
+        "far": ("ablation=distance_15cm",),
+        "graff": ("method=graff",),
+        "graff-far": ("method=graff", "ablation=distance_15cm"),
+        "hand": ("hand=dhand",),
+        "hand-far": ("hand=dhand", "ablation=distance_15cm"),
+    }
+    for name, overrides in own.items():
+        make(tmp_path / "runs" / name, 0.3, "task=cup-pour1", *overrides)
+    report(tmp_path / "runs")
+    figures = {
+        (row["table"], row["setting"], row["row"]): (
+            *(row["paper_success"], row["paper_com_error"]),
+            row["paper_success_same_tasks"],
+        )
+        for row in rows("averages")
+    }
+    said = {key: stated for key, stated in figures.items() if any(stated)}
+    far = "pgdm, ablation=distance_15cm"
+    assert {key for key in figures if key[0] == "ablation"} == {
+        *(("ablation", "pgdm", "none"), ("ablation", far, "distance_15cm")),
+        ("ablation", f"{far}, ablation.distance_m=0.05", "distance_15cm, distance_m=0.05"),
+        *(("ablation", "graff", "none"), ("ablation", "pgdm, hand=dhand", "none")),
+        ("ablation", "graff, ablation=distance_15cm", "distance_15cm"),
+        ("ablation", f"{far}, hand=dhand", "distance_15cm"),
+    }
+    assert said == {
+        ("source", "pgdm", "all"): ("0.745", "0.00523", "0.831"),
+        ("source", "pgdm", "mocap"): ("0.75", "0.00445", "0.831"),
+        ("ablation", "pgdm", "none"): ("0.755", "0.00482", "0.831"),
+        ("ablation", far, "distance_15cm"): ("0.286", "0.0117", ""),
+        ("baseline", "pgdm", "pgdm with pre-grasp"): ("0.755", "0.00482", "0.831"),
+    }
+
+
 def test_rows_of_one_name_stand_in_groups_of_their_own(tmp_path: Path) -> None:
     root = tmp_path / "runs"
     for number, action in enumerate(("absolute", "residual")):
@@ -56,7 +94,15 @@ def test_rows_of_different_tasks_do_not_compare(tmp_path: Path) -> None:
     make(tmp_path / "runs" / "none", 0.1, "task=cup-pour1", "pregrasp=none")
     assert said not in text_of(report(tmp_path / "runs"))
     make(tmp_path / "runs" / "hammer", 0.7, "task=hammer-use1")
-    assert text_of(report(tmp_path / "runs")).count(said) == 1
+    text = text_of(report(tmp_path / "runs"))
+    assert text.count(said) == 1
+    assert "share no task" not in text
+    apart = tmp_path / "apart"
+    make(apart / "cup", 0.7, "task=cup-pour1")
+    make(apart / "none", 0.1, "task=hammer-use1", "pregrasp=none")
+    text = text_of(report(apart, out=apart / "out"))
+    assert f"{said} They share no task and so have no curve." in text
+    assert not (apart / "out" / "baselines_curves.png").exists()
 
 
 def test_one_run_a_task_is_counted_and_no_probability(tmp_path: Path) -> None:

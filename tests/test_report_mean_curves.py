@@ -14,6 +14,7 @@ from pgdm.report import figures, mean_curves, tables
 from pgdm.report.results import Results
 from pgdm.report.runs import ERROR, SUCCESS
 from pgdm.report.settings import Setting, setting_of
+from pgdm.report.statistics import Estimate
 from report_runs import curve_run
 
 STEEP = {0: 0.0, 10: 0.2, 20: 0.4, 40: 0.8}
@@ -109,6 +110,77 @@ def test_groups_have_panels_of_their_own_and_one_scale() -> None:
     assert small.get_ylim() == large.get_ylim() == (-0.02, 1.0)
 
 
+def test_a_name_of_the_legend_has_one_colour_in_all_panels() -> None:
+    # Of other methods the same ablations, and one of them in one panel only.
+    made = [
+        *(("ablation=none",), ("ablation=mean_hand",)),
+        *(("method=graff",), ("method=graff", "ablation=open_hand")),
+        ("method=graff", "ablation=mean_hand"),
+        ("method=graff", "ablation=distance_15cm", "ablation.distance_m=0.05"),
+    ]
+    results = Results([curve_run(setting(*own), "a", STEEP) for own in made])
+    figure = mean_curves.compared(results, tables.by_ablation(results))
+    assert figure is not None
+    legend = figure.legends[0]
+    names = [text.get_text() for text in legend.texts]
+    assert names == ["none", "mean_hand", "open_hand", "distance_15cm, distance_m=0.05"]
+    none, mean, opened, near = (to_rgba(line.get_color()) for line in legend.get_lines())
+    assert len({none, mean, opened, near}) == 4
+    plain, _, graff, _ = figure.axes
+    assert [to_rgba(line.get_color()) for line in plain.lines] == [none, mean]
+    drawn = [to_rgba(line.get_color()) for line in graff.lines]
+    assert (drawn[0], sorted(drawn)) == (none, sorted([none, mean, opened, near]))
+
+
+def test_a_method_and_its_values_have_one_hue_in_all_panels() -> None:
+    short = ("method=curriculum", "method.curriculum.ramp_frames=40")
+    made = [(), ("pregrasp=none",), short, (*short, "pregrasp=none"), ("method=curriculum",)]
+    runs = [
+        curve_run(setting(*own, f"action={action}"), "a", STEEP)
+        for own in made
+        for action in ("absolute", "residual")
+    ]
+    rows = tables.baselines(Results(runs))
+    shades, found = figures.shades(rows), {}
+    for row in rows:
+        found.setdefault(row.name, set()).add(shades[row.setting])
+    assert {len(colours) for colours in found.values()} == {1}
+    colour = {name: colours.pop() for name, colours in found.items()}
+    ramp = ", ramp_frames=40"
+    assert set(colour) == {
+        *("pgdm with pre-grasp", "pgdm without pre-grasp", "curriculum with pre-grasp"),
+        *(f"curriculum with pre-grasp{ramp}", f"curriculum without pre-grasp{ramp}"),
+    }
+    own = colour[f"curriculum with pre-grasp{ramp}"]
+    assert own[:3] == colour[f"curriculum without pre-grasp{ramp}"][:3]
+    assert (
+        len({own[:3], colour["curriculum with pre-grasp"][:3], colour["pgdm with pre-grasp"][:3]})
+        == 3
+    )
+
+
+def test_rows_that_share_no_task_are_told() -> None:
+    graff = ("method=graff", "ablation=open_hand")
+    results = Results(
+        [
+            curve_run(setting(), "a", STEEP),
+            curve_run(setting("ablation=open_hand"), "b", FLAT),
+            curve_run(setting("method=graff"), "a", STEEP),
+            curve_run(setting(*graff), "b", FLAT),
+            curve_run(setting(*graff), "a", FLAT, state="running"),  # which has a curve
+        ]
+    )
+    rows = tables.by_ablation(results)
+    assert [row.tasks for row in rows] == [("a",), ("b",), ("a",), ("b",)]
+    figure = mean_curves.compared(results, rows)
+    assert figure is not None
+    assert titles(figure) == ["method=graff, mean of the 1 task that all have"]
+    assert mean_curves.apart(results, rows) == {"no further change"}
+    once = Results([curve_run(s, "a", {40: 0.5}) for s in (setting(), setting("pregrasp=none"))])
+    assert mean_curves.compared(once, tables.baselines(once)) is None
+    assert mean_curves.apart(once, tables.baselines(once)) == set()  # not for want of tasks
+
+
 def test_nothing_is_drawn_where_nothing_is_shared_or_evaluated() -> None:
     plain, bare = setting(), setting("pregrasp=none")
     apart = Results([curve_run(plain, "a", STEEP), curve_run(bare, "b", FLAT)])
@@ -174,3 +246,14 @@ def test_pregrasps_of_two_sources_have_names_and_hues_of_their_own() -> None:
     ]
     planned, mined, none = figures.shades(rows).values()
     assert planned[:3] == none[:3] != mined[:3]
+
+
+def test_the_axis_of_interquartile_means_has_only_what_success_can_be() -> None:
+    made = setting()
+    results = Results([curve_run(made, "a", STEEP)])
+    for value, low, high in ((0.01, 0.0, 0.6), (0.0, np.nan, np.nan), (0.9, 0.4, 1.0)):
+        figure = figures.intervals(results, {made: Estimate(value, low, high)}, "mean")
+        left, right = figure.axes[0].get_xlim()
+        assert 0.0 <= left <= value <= right <= 1.0
+    low_end = figures.intervals(results, {made: Estimate(0.01, 0.0, 0.6)}, "mean").axes[0]
+    assert low_end.get_xlim()[0] == 0.0

@@ -64,8 +64,20 @@ def test_what_the_page_says(page: Path) -> None:
 
 
 def test_no_better_than_doing_nothing_is_red(page: Path) -> None:
-    found = re.findall(r'<th>([a-z0-9-]+)</th>\s*<td class="bad"><b>', page.read_text())
+    text = page.read_text()
+    found = re.findall(r'<th>([a-z0-9-]+)</th>\s*<td class="bad"><b>', text)
     assert found == ["toothbrush-lift"]  # 30% where nothing gives 45%; failed runs have no number
+    overview = text[text.index('id="overview"') : text.index('id="source"')]
+    assert re.findall(r'<b class="bad">(.*?)</b>', overview) == ["30.0%"]
+    assert re.findall(r'<b class="">(.*?)</b>', overview) == ["60.0%", "10.0%", "80.0%"]
+
+
+def test_exactly_as_good_as_doing_nothing_is_no_better(tmp_path: Path) -> None:
+    make(tmp_path / "runs" / "a", 1 / 19, "task=spheremedium-lift")  # nothing has 1 of 19 steps
+    make(tmp_path / "runs" / "b", 0.0527, "task=spheremedium-lift", "pregrasp=none")
+    text = report(tmp_path / "runs")
+    assert re.findall(r'class="bad">(?:<b>)?(5.3%)', text) == ["5.3%"] * 2  # in both tables
+    assert text.count("5.3%") > 4
 
 
 def test_all_files_are_there_and_pictures_are_whole(page: Path) -> None:

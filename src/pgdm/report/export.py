@@ -13,7 +13,8 @@ from pgdm.report.results import Results
 from pgdm.report.runs import METRICS, RETURN
 from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
-from pgdm.report.tables import THRESHOLDS, Average, Improvement, TaskRow
+from pgdm.report.tables import THRESHOLDS, Average, Improvement
+from pgdm.report.task_table import TaskRow
 
 FILES = (
     "runs.csv",
@@ -24,13 +25,16 @@ FILES = (
     "curves.csv",
 )
 
-ABLATION = (
+FACTS = (
+    "asset_source",
+    "wall_time_s",
+    "git",
     "ablation_distance_mm",
     "ablation_retreat_mm",
     "ablation_finger_error_rad",
     "ablation_depth_mm",
 )
-"""What a run tells of its ablated start; empty without an ablation."""
+"""What a run tells of itself, of its ablated start only with an ablation."""
 
 Aggregates = dict[Setting, tuple[Estimate, list[Estimate], int, int]]
 Improvements = dict[tuple[Setting, Setting], Improvement]
@@ -44,7 +48,7 @@ def runs(results: Results, out: Path) -> None:
             *(run.task, results.labels[run.setting], run.seed, run.state),
             *("yes" if run.finished else "no", run.frames, run.setting.total_frames, run.budget),
             run.start,
-            *(run.result.get(fact, "") for fact in ("wall_time_s", "git", *ABLATION)),
+            *(run.result.get(fact, "") for fact in FACTS),
             *(run.metric(name) for name in METRICS),
             os.path.relpath(run.path, out.absolute()),
         ]
@@ -52,7 +56,7 @@ def runs(results: Results, out: Path) -> None:
     ]
     _write(
         out / "runs.csv",
-        [*head, "start", "wall_time_s", "git", *ABLATION, *METRICS, "folder"],
+        [*head, "start", *FACTS, *METRICS, "folder"],
         rows,
     )
 
@@ -60,13 +64,15 @@ def runs(results: Results, out: Path) -> None:
 def tasks(results: Results, rows: Iterable[TaskRow], out: Path) -> None:
     """Write ``tasks.csv``: the table by task."""
     head = ["task", "setting", "pregrasp_source", "seeds_finished", "seeds", "frames", "success"]
-    head += ["success_mean_action", "com_error_released", "lifted", "paper_success"]
-    head += ["paper_com_error", "difference", "null_success", "comparable_with_paper"]
+    head += ["success_mean_action", "com_error_released", "lifted", "hand_error_m"]
+    head += ["contact_distance_m", "paper_success", "paper_com_error", "difference"]
+    head += ["null_success", "comparable_with_paper"]
     table = [
         [
             *(row.task, results.labels[row.setting], row.source, row.done),
             " ".join(f"{seed}:{state}" for seed, state in row.seeds.items()),
             *(row.frames, row.success, row.success_mean_action, row.error, row.lifted),
+            *(row.fingertips, row.contacts),
             *(row.paper_success, row.paper_error, row.difference, row.null),
             "yes" if row.comparable else "no",
         ]

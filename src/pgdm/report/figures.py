@@ -34,7 +34,6 @@ RGBA = tuple[float, float, float, float]
 Pairs = tuple[Figure, list[tuple[Axes, Axes]]]
 _WIDTH_IN = 5.2
 _PALE = 0.45  # opacity without pre-grasps
-_HUES = ("method", "ablation", "pregrasp")  # what rows of one hue have in common
 _CEILINGS = (0.1, 0.2, 0.5, 1.0)  # success that axes may end at
 _THUMB = (240, 180)  # pixels of a film's picture
 _SHADES = 12  # of a colour in a drawing: lines have soft edges
@@ -46,12 +45,14 @@ def colour(results: Results, setting: Setting) -> str:
 
 
 def intervals(results: Results, estimates: dict[Setting, Estimate], name: str) -> Figure:
-    """Draw one estimate a setting, with its interval."""
+    """Draw one estimate of success a setting, with its interval."""
     figure, axes = _rows([results.labels[setting] for setting in estimates])
     for row, (setting, (value, low, high)) in enumerate(estimates.items()):
         shade = colour(results, setting)
         axes.plot([low, high], [row, row], color=shade, lw=6, alpha=0.35)
-        axes.plot([value], [row], "o", color=shade, ms=5)
+        axes.plot([value], [row], "o", color=shade, ms=5, clip_on=False)
+    low, high = axes.get_xlim()
+    axes.set_xlim(max(low, 0.0), min(high, 1.0))  # no success lies beyond
     axes.set_xlabel(name, fontsize=9)
     return figure
 
@@ -96,17 +97,17 @@ def bars(rows: Sequence[Average]) -> Figure:
 
 
 def shades(rows: Sequence[Average]) -> dict[Setting, RGBA]:
-    """Return the rows' colours: a hue for each method or ablation, pale without pre-grasps."""
-    kinds = {
-        row.setting: tuple(c for c in row.setting.within(*_HUES) if c != "pregrasp=none")
-        for row in rows
-    }
-    hues = list(dict.fromkeys(kinds.values()))
+    """Return the rows' colours: pale without pre-grasps, the hue by their names.
+
+    All groups share one legend, so a name has one hue whatever the setting differs in besides.
+    """
+    hues = list(dict.fromkeys(row.hue for row in rows))
     return {
-        setting: to_rgba(
-            COLOURS[hues.index(kind) % len(COLOURS)], 1.0 if setting.with_pregrasp else _PALE
+        row.setting: to_rgba(
+            COLOURS[hues.index(row.hue) % len(COLOURS)],
+            1.0 if row.setting.with_pregrasp else _PALE,
         )
-        for setting, kind in kinds.items()
+        for row in rows
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,7 +54,7 @@ def compared(results: Results, rows: Sequence[Average]) -> Figure | None:
     shade, panels = shades(rows), {}
     for group, own in by_group(rows).items():
         runs = [_runs(results, row) for row in own]
-        tasks = [task for task in runs[0] if all(task in others for others in runs)]
+        tasks = _shared(runs)
         if tasks:
             lines = [
                 Line(row.name, [found[task] for task in tasks], _style(row, shade[row.setting]))
@@ -64,6 +64,16 @@ def compared(results: Results, rows: Sequence[Average]) -> Figure | None:
             many = f"the {count} that all have" if len(own) > 1 else count
             panels[_title(group, f"mean of {many}")] = lines
     return _drawn(panels)
+
+
+def apart(results: Results, rows: Sequence[Average]) -> set[str]:
+    """Return the groups whose rows share no task, which is why they have no curve."""
+    return {
+        group
+        for group, own in by_group(rows).items()
+        if not _shared([row.tasks for row in own])
+        and not _shared([_runs(results, row) for row in own])
+    }
 
 
 def validated(results: Results, rows: Sequence[Average]) -> Figure | None:
@@ -98,6 +108,11 @@ def _runs(results: Results, row: Average) -> dict[str, list[Run]]:
         if runs:
             found[task] = [run for run in runs if run.finished] or runs
     return found
+
+
+def _shared(each: Sequence[Collection[str]]) -> list[str]:
+    """Return the tasks that all have."""
+    return [task for task in each[0] if all(task in others for others in each)]
 
 
 def _style(row: Average, shade: Any) -> dict[str, Any]:

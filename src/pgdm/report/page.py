@@ -18,13 +18,14 @@ from matplotlib.figure import Figure
 
 from pgdm.config.store import PAPER_FRAMES
 from pgdm.errors import RunError
-from pgdm.report import export, figures, mean_curves, tables
+from pgdm.report import alike, export, figures, mean_curves, tables
 from pgdm.report.curves import curves
 from pgdm.report.results import Results, paper
 from pgdm.report.runs import ERROR, SUCCESS
 from pgdm.report.settings import shared
 from pgdm.report.source import Found, Progress, find
 from pgdm.report.statistics import DRAWS, Estimate
+from pgdm.report.task_table import task_rows
 
 PAGE = "report.html"
 _NONE = "-"
@@ -65,7 +66,7 @@ def write_report(
 def _context(
     results: Results, found: Found, places: Sequence[str], out: Path, progress: Progress
 ) -> dict[str, Any]:
-    by_task = {setting: tables.task_rows(results, setting) for setting in results.settings}
+    by_task = {setting: task_rows(results, setting) for setting in results.settings}
     progress("computing statistics", 0, 1)
     averages = {
         "source": tables.by_source(results),
@@ -85,11 +86,14 @@ def _context(
         "places": places,
         "now": time.strftime("%Y-%m-%d %H:%M"),
         "counts": results.counts(),
+        "mixed": alike.mixed(results),
+        "doubles": alike.left_out(results),
         "budgets": Counter(run.budget for run in results.runs),
         "shared": shared(results.settings),
         "deviations": {s: results.deviations(s) for s in results.settings},
         "colours": {s: figures.colour(results, s) for s in results.settings},
         "averages": averages,
+        "apart": {t: mean_curves.apart(results, averages[t]) for t in ("ablation", "baseline")},
         "by_task": by_task,
         "aggregates": aggregates,
         "better": better,
@@ -100,7 +104,10 @@ def _context(
         "commands": _commands(results),
         "typed": found.commands,
         "unreadable": found.unreadable,
-        "folders": {run.path: os.path.relpath(run.path, out.absolute()) for run in results.runs},
+        "folders": {
+            run.path: os.path.relpath(run.path, out.absolute())
+            for run in (*results.runs, *results.doubles)
+        },
         "paper_frames": PAPER_FRAMES,
         "draws": DRAWS,
         "files": [*export.FILES, *(f"{name}.png" for name in pictures)],
@@ -165,6 +172,7 @@ def _provenance(results: Results) -> list[tuple[str, list[tuple[str, int]]]]:
             "git revision": run.result.get("git"),
             "assets": run.result.get("asset_source"),
             "start": run.result.get("pregrasp_used"),
+            "expert hand": run.result.get("expert_hand"),
             **run.result.get("versions", {}),
         }
         for name, value in of_run.items():
@@ -198,6 +206,7 @@ def _render(context: dict[str, Any]) -> str:
         "percent": lambda value, digits=1: _shown(value, f".{digits}%"),
         "points": lambda value: _shown(100 * value, "+.1f"),
         "metres": lambda value: _shown(value, ".2e"),
+        "centimetres": lambda value: _shown(100 * value, ".1f"),
         "radians": lambda value: _shown(value, ".2f"),
         "between": _between,
         "frames": _frames,

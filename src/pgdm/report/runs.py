@@ -22,6 +22,10 @@ SUCCESS_MEAN = "eval_deterministic/success"
 ERROR = "eval_sampled/com_error_released"
 ROTATION = "eval_sampled/ori_error"
 LIFTED = "eval_sampled/lifted"
+FINGERTIPS = "eval_sampled/hand_error_m"
+"""How far fingertips are from the expert's; only methods that follow one record it."""
+CONTACTS = "eval_sampled/contact_distance_m"
+"""The same of its contact points."""
 METRICS = (
     SUCCESS,
     SUCCESS_MEAN,
@@ -30,6 +34,8 @@ METRICS = (
     ROTATION,
     LIFTED,
     "eval_deterministic/lifted",
+    FINGERTIPS,
+    CONTACTS,
 )
 RETURN = "train/return"
 MISSING = "missing"

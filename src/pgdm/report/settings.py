@@ -58,6 +58,11 @@ class Setting:
         """Whether it is the paper's own method as it stands, which its figures of tasks are of."""
         return self.method == "pgdm" and self.option("ablation") == "none" and self.with_pregrasp
 
+    @property
+    def own_hand(self) -> bool:
+        """Whether each task has the hand that it is for, as in the paper."""
+        return not self.within("hand")
+
     def within(self, *groups: str) -> tuple[str, ...]:
         """Return its changes that belong to some config groups."""
         return tuple(c for c in self.changes if re.split("[.=]", c)[0] in groups)

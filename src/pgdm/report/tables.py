@@ -1,4 +1,4 @@
-"""The report's tables: by task, and averages set beside those of the paper."""
+"""The report's tables of averages, set beside those of the paper."""
 
 from __future__ import annotations
 
@@ -11,47 +11,14 @@ import numpy as np
 
 from pgdm.report import statistics
 from pgdm.report.results import Results, average, known, paper
-from pgdm.report.runs import ERROR, LIFTED, ROTATION, SUCCESS, SUCCESS_MEAN, Run
+from pgdm.report.runs import ERROR, ROTATION, SUCCESS, Run
 from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
 
 NOTHING = Estimate(np.nan, np.nan, np.nan)
+_WITH, _WITHOUT = " with pre-grasp", " without pre-grasp"
 THRESHOLDS = np.linspace(0.0, 1.0, 51)
 """Of the performance profile, in success."""
-
-
-@dataclass(frozen=True)
-class TaskRow:
-    """One setting on one task; means over the seeds that finished."""
-
-    setting: Setting
-    task: str
-    source: str
-    """Where the task's pre-grasp came from."""
-    seeds: dict[int, str]
-    """Seed to state."""
-    frames: int
-    """Fewest environment steps of a finished run; 0 if none has finished."""
-    success: float
-    success_mean_action: float
-    error: float
-    lifted: float
-    paper_success: float
-    paper_error: float
-    null: float
-    """Success if the object never moves."""
-    comparable: bool
-    """Whether the paper's figures were made the same way."""
-
-    @property
-    def difference(self) -> float:
-        """Success less the paper's."""
-        return self.success - self.paper_success
-
-    @property
-    def done(self) -> int:
-        """How many seeds have finished."""
-        return sum(state == "finished" for state in self.seeds.values())
 
 
 @dataclass(frozen=True)
@@ -77,9 +44,15 @@ class Average:
     """The paper's figures of the same tasks, averaged: ``success`` and ``com_error``; NaN where
     the row is not what they are of, PGDM as it stands."""
     paper: dict[str, float] = field(default_factory=dict)
-    """The paper's own average: ``success``, ``com_error``, and ``tasks`` where it says so."""
+    """The paper's own average: ``success``, ``com_error``, and ``tasks`` where it says so; empty
+    where the row is none of the paper's: another method's ablation, other values, another hand."""
     deviations: tuple[str, ...] = ()
     """Why it cannot be set against the paper's."""
+
+    @property
+    def hue(self) -> str:
+        """What has one hue in all groups: its name, whether with or without pre-grasps."""
+        return self.name.replace(_WITHOUT, _WITH)
 
 
 class Improvement(NamedTuple):
@@ -103,39 +76,6 @@ class Improvement(NamedTuple):
         return self.chance.value * self.tasks
 
 
-def task_rows(results: Results, setting: Setting) -> list[TaskRow]:
-    """Return the table of one setting, a row a task."""
-    rows = []
-    comparable = not results.deviations(setting)
-    for task in results.tasks:
-        runs = results.cell(setting, task)
-        if not runs:
-            continue
-        done = [run for run in runs if run.finished]
-
-        def mean(metric: str, done: list[Run] = done) -> float:
-            return average(run.metric(metric) for run in done)
-
-        rows.append(
-            TaskRow(
-                setting=setting,
-                task=task,
-                source=str(runs[0].facts.get("pregrasp_source", "?")),
-                seeds=results.states(setting, task),
-                frames=min((run.frames for run in done), default=0),
-                success=mean(SUCCESS),
-                success_mean_action=mean(SUCCESS_MEAN),
-                error=mean(ERROR),
-                lifted=mean(LIFTED),
-                paper_success=known(runs[0], "paper_success"),
-                paper_error=known(runs[0], "paper_com_error"),
-                null=paper()["null_policy"].get(task, np.nan),
-                comparable=comparable,
-            )
-        )
-    return rows
-
-
 def by_source(results: Results) -> list[Average]:
     """Return Table I: each setting with the plain method and pre-grasps, by their source."""
     rows = []
@@ -155,10 +95,10 @@ def by_ablation(results: Results) -> list[Average]:
     groups = _groups(shown, "ablation")
     rows = []
     for setting in shown:
-        name = setting.option("ablation")
-        figures = paper()["by_ablation"].get(name, {})
-        name += _values(setting, "ablation")
-        args = results, "ablation", setting, name, groups[setting], figures, _in_tcdm30
+        name, values = setting.option("ablation"), _values(setting, "ablation")
+        own = setting.method == "pgdm" and not values
+        figures = paper()["by_ablation"].get(name, {}) if own else {}
+        args = results, "ablation", setting, name + values, groups[setting], figures, _in_tcdm30
         rows += _average(*args, "ablation")
     return rows
 
@@ -173,7 +113,7 @@ def baselines(results: Results) -> list[Average]:
     rows = []
     for setting, same in kinds.items():
         figures = paper()["by_ablation"]["none"] if setting.plain else {}
-        name = f"{setting.method} {'with' if setting.with_pregrasp else 'without'} pre-grasp"
+        name = setting.method + (_WITH if setting.with_pregrasp else _WITHOUT)
         name += _values(setting, "method")
         name += "".join(f", {c}" for c in setting.within("pregrasp") if c != "pregrasp=none")
         args = results, "baseline", setting, name, groups[setting], figures, _in_tcdm30
@@ -251,7 +191,8 @@ def _average(
 
     def stated(figure: str) -> float:
         first = [results.cell(setting, task)[0] for task in scores]
-        return average(known(run, figure) for run in first) if setting.plain else np.nan
+        own = setting.plain and setting.own_hand
+        return average(known(run, figure) for run in first) if own else np.nan
 
     yield Average(
         table=table,
@@ -265,7 +206,7 @@ def _average(
         error=estimate(ERROR),
         rotation=estimate(ROTATION),
         same={"success": stated("paper_success"), "com_error": stated("paper_com_error")},
-        paper=figures,
+        paper=figures if setting.own_hand else {},
         deviations=tuple(results.deviations(setting, *same)),
     )
 
