@@ -44,7 +44,7 @@ TAGS = {
     "seed": "seed",
     "budget": "budget",
 }
-FACTS = ("asset_source", "pregrasp_used", "motion_sha256", "git")
+FACTS = ("asset_source", "pregrasp_used", "expert_hand", "motion_sha256", "git")
 """What only the run itself knew, kept in ``result.json`` and ``mlflow.json``."""
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
