@@ -50,6 +50,6 @@ def view_ablations(
 
 def _figures(ablated: Ablated, asked_m: float) -> str:
     parts = [f"penetration {1e3 * ablated.depth_m:.1f} mm"]
-    if ablated.distance_m > 0:
+    if ablated.distance_m > ablated.retreat_m:
         parts.append(f"wrist {1e2 * ablated.distance_m:.1f} cm off")
     return ", ".join(filter(None, (*parts, ablated.compromises(asked_m))))
