@@ -182,6 +182,10 @@ def test_a_changed_pickle_gives_a_value_or_our_error(data: st.DataObject) -> Non
         assert str(error).startswith("x: ")
 
 
+def test_an_odd_escape_is_no_warning() -> None:
+    assert safe_pickle.loads(b"S'\\u'\n.", "x") == "\\u"
+
+
 @given(st.data())
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_changed_file_gives_arrays_or_our_error(tmp_path: Path, data: st.DataObject) -> None:

@@ -12,6 +12,7 @@ import io
 import math
 import pickle
 import pickletools
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -220,8 +221,11 @@ def loads(data: bytes, label: str) -> Any:
         CorruptAssetError: it cannot be read.
     """
     try:
-        _scan(data, label)
-        return _plain(_Unpickler(data, label).load(), {})
+        with warnings.catch_warnings():
+            # Of an odd escape in a string: a matter of the file, not of a programmer.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            _scan(data, label)
+            return _plain(_Unpickler(data, label).load(), {})
     except READ_ERRORS as error:
         raise CorruptAssetError(f"{label}: unreadable pickle ({reason(error)})") from error
 
