@@ -129,6 +129,14 @@ def test_the_table_names_all_that_is_active() -> None:
     ]
 
 
+def test_a_schedule_that_outlasts_a_run_is_told(library_home: Path) -> None:
+    curriculum = recipe(compose(["method=curriculum"]).method)
+    assert curriculum.unfinished(1_000_000) == [("tracking", 2.5, 10.0)]
+    assert curriculum.unfinished(4_000_000) == []
+    line = ["task=cup-pour1", "method=curriculum", "total_frames=1000000", "--dry-run"]
+    assert "weight of 'tracking' only comes to 2.5 of 10" in command("pgdm-run", *line).out
+
+
 def test_a_dry_run_of_one_run_shows_its_terms(tmp_path: Path) -> None:
     outcome = command("pgdm-run", "task=cup-pour1", "method=curriculum", "--dry-run")
     assert outcome.code == 0

@@ -11,6 +11,9 @@ from pgdm.errors import ConfigError
 from pgdm.mdp.context import StepContext
 from pgdm.mdp.metrics import MetricsCfg
 
+_NEVER = 10**15
+"""Frames by which any schedule has come to its end."""
+
 
 @dataclass(frozen=True)
 class RewardTerm:
@@ -90,19 +93,21 @@ class Recipe:
 
     def unfinished(self, frames: int) -> list[tuple[str, float, float]]:
         """Return (name, weight, final weight) of rewards whose schedule outlasts so many frames."""
-        final = {term.name: term.weight for term in self.rewards}
-        last = {name: w for schedule in self.schedules for name, w in schedule(frames).items()}
-        return [(name, w, final[name]) for name, w in last.items() if w != final[name]]
+        last, final = self._scheduled(frames), self._scheduled(_NEVER)
+        return [(name, last[name], w) for name, w in final.items() if last[name] != w]
 
     def table(self) -> list[tuple[str, str, str]]:
         """Return what is active as rows (kind, name, weight), for people to read."""
-        first = {name: w for schedule in self.schedules for name, w in schedule(0).items()}
+        first = self._scheduled(0)
         rows = [
             ("reward", term.name, _weight(term.weight, first.get(term.name)))
             for term in self.rewards
         ]
         rows += [("end", end.name, "") for end in self.ends]
         return rows + [("measure", measure.name, "") for measure in self.measures]
+
+    def _scheduled(self, frames: int) -> dict[str, float]:
+        return {name: w for schedule in self.schedules for name, w in schedule(frames).items()}
 
 
 def _weight(weight: float, first: float | None) -> str:
