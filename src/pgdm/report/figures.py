@@ -26,7 +26,7 @@ from pgdm.report.tables import THRESHOLDS, Average, by_group
 # Okabe and Ito's colours, which colour-blind people can tell apart, then darker ones.
 COLOURS = (
     *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F", "#000000"),
-    *("#332288", "#882255", "#999933", "#44AA99"),
+    *("#332288", "#882255", "#999933", "#44AA99", "#117733", "#AA4499", "#661100", "#6699CC"),
 )
 DPI = 150
 NAMES = {SUCCESS: "success", ERROR: "COM error [m]"}
