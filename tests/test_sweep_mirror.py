@@ -6,6 +6,7 @@ import dataclasses
 import os
 import shutil
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from pgdm.sweep.plan import Plan, write_plan
 from pgdm.sweep.processes import Process
 from pgdm.tracking import RunFolder, TrackingCfg, open_tracker
 from pgdm.tracking.mlflow import Store, store_uri
-from pgdm.tracking.run_folder import LINK, read_json
+from pgdm.tracking.run_folder import LINK, PARENT, read_json, write_json
 from pgdm.tracking.sync import sync
 from sweep_plans import plan, start
 
@@ -93,9 +94,16 @@ def test_jobs_are_shown_below_it(whole: Plan, tmp_path: Path) -> None:
     assert not (whole.folder / "runs" / "mlflow.db").exists()
 
 
-@pytest.mark.parametrize(("status", "shown"), [("interrupted", "KILLED"), ("finished", "FINISHED")])
+@pytest.mark.parametrize(
+    ("status", "shown", "named"),
+    [
+        ("interrupted", "KILLED", True),
+        ("interrupted", "KILLED", False),  # killed before its folder said which run is its own
+        ("finished", "FINISHED", True),
+    ],
+)
 def test_a_killed_job_gets_its_true_status(
-    whole: Plan, tmp_path: Path, status: str, shown: str
+    whole: Plan, tmp_path: Path, status: str, shown: str, named: bool
 ) -> None:
     mirror = SweepMirror.of(whole, tell)
     mirror.open(whole)
@@ -111,6 +119,9 @@ def test_a_killed_job_gets_its_true_status(
     train(folder)
     if status == "finished":
         end(folder)
+    if not named:
+        link = read_json(folder.path / LINK)
+        write_json(folder.path / LINK, {PARENT: link[PARENT]})
     mirror.correct(folder.path)
     assert runs(whole.folder)["s0"] == (shown, "study")
     assert [done.action for done in sync(whole.folder)] == [
@@ -147,6 +158,29 @@ def test_status_tells_mlflow_that_a_sweep_was_killed(whole: Plan, tmp_path: Path
             number = ledger.begin(key, Process.of(os.getpid()))
             ledger.end(key, number, Ending("finished", 0, 32, {}, None))
             ledger.set_states({key: "finished"})
+
+
+def test_a_job_that_outlives_its_sweep_and_is_killed_then(whole: Plan) -> None:
+    mirror = SweepMirror.of(whole, tell)
+    mirror.open(whole)
+    ledger = Ledger(whole.folder)
+    ledger.add(whole)
+    folder = make(Path(whole.jobs[0].cfg.run_dir), tracking={"experiment": "other"})
+    (folder.path / ".lock").touch()
+    mirror.adopt(whole.jobs[0])
+    tracker = open_tracker(TrackingCfg("mlflow", None, "other"), folder, {})
+    tracker._pool.shutdown()  # type: ignore[attr-defined] # what it began is done: the run is there
+    name, status = folder.path.name, ("sweep", "status", str(whole.folder))
+    worker = subprocess.Popen(["sleep", "60"])
+    try:
+        ledger.begin(whole.jobs[0].key, Process.of(worker.pid))
+        assert command("pgdm", *status).code == 0
+        assert runs(whole.folder) == {"study": ("KILLED", None), name: ("RUNNING", "study")}
+    finally:
+        worker.kill()
+        worker.wait()
+    assert command("pgdm", *status).code == 0
+    assert runs(whole.folder) == {"study": ("KILLED", None), name: ("KILLED", "study")}
 
 
 def test_mlflow_out_of_reach_stops_nothing(whole: Plan) -> None:

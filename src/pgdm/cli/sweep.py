@@ -200,12 +200,10 @@ def settled(folder: Path, queue: Queue | None = None) -> Ledger:
     if parent(ledger) is not None:
         return ledger  # it sees to all that itself
     closed = settle(ledger, queue)
-    mirror = SweepMirror.left_running(ledger.folder, lambda text: print(text, file=sys.stderr))
-    if mirror is not None:
-        for entry in closed:
-            mirror.correct(entry.run_dir)
-        whole = all(state == FINISHED for state in ledger.states().values())
-        mirror.close(FINISHED if whole else INTERRUPTED)
+    whole = all(state == FINISHED for state in ledger.states().values())
+    dead = [entry.run_dir for entry in closed]
+    status = FINISHED if whole else INTERRUPTED
+    SweepMirror.set_right(ledger.folder, dead, status, lambda text: print(text, file=sys.stderr))
     return ledger
 
 

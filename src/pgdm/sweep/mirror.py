@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,14 +50,26 @@ class SweepMirror:
         return cls(Group(plan.folder, uri, chosen.experiment), notify)
 
     @classmethod
-    def left_running(cls, folder: Path, notify: Notify) -> SweepMirror | None:
-        """Return the mirror of a sweep that MLflow still holds to be running, or None."""
+    def set_right(cls, folder: Path, dead: Sequence[Path], status: str, notify: Notify) -> None:
+        """Tell MLflow the truth about a sweep that nobody drives.
+
+        Args:
+            folder: of the sweep.
+            dead: run folders whose workers were found dead; the sweep may have been closed before.
+            status: how the sweep ended, for MLflow that still holds it to be running.
+            notify: told in a sentence if MLflow fails.
+        """
         link = read_json(folder / LINK)
-        if link.get("status") != RUNNING:
-            return None
+        running = link.get("status") == RUNNING
+        if not running and not (dead and "uri" in link):
+            return
         from pgdm.tracking.group import Group
 
-        return cls(Group(folder, link["uri"], link["experiment"]), notify)
+        mirror = cls(Group(folder, link["uri"], link["experiment"]), notify)
+        for run_dir in dead:
+            mirror.correct(run_dir)
+        if running:
+            mirror.close(status)
 
     def open(self, plan: Plan) -> None:
         """Make what MLflow needs, before any job starts."""

@@ -55,16 +55,19 @@ class Group:
     def correct(self, run_dir: Path) -> None:
         """Give a run that was killed the status that its folder tells, if it is of this group."""
         folder = RunFolder(run_dir)
-        run_id, status = folder.link.get("run_id"), folder.status()
+        status = folder.status()
         if not folder.parent() or status == "running":
             return
         with _told(self.uri):
             store = Store.open(self.uri, self._experiment)
             if status == "finished":  # nobody else tells the rest, or even that it was there
                 sync_run(store, folder)
-            elif run_id and store.client.get_run(run_id).info.status == STATUS["running"]:
+                return
+            # Its folder may not name it: it was killed before it could write that down.
+            run = find_run(store, folder)
+            if run is not None and run.info.status == STATUS["running"]:
                 ended_ms = int(1000 * folder.modified())
-                store.client.set_terminated(run_id, STATUS[status], ended_ms)
+                store.client.set_terminated(run.info.run_id, STATUS[status], ended_ms)
 
     def close(self, status: str) -> None:
         """Say how it ended: ``finished``, ``interrupted`` or ``failed``."""
