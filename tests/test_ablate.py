@@ -19,7 +19,8 @@ from pgdm.envs.build import EnvBuilder
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
-from pgdm.pregrasp.ablate import OVERLAP_M, Ablated, AblationCfg, ablate
+from pgdm.pregrasp.ablate import OVERLAP_M, AblationCfg, ablate
+from pgdm.pregrasp.ablated import Ablated
 from pgdm.pregrasp.sources import StartState, start_state
 from pgdm.sim.contact import HandContact
 
@@ -144,6 +145,21 @@ def test_without_an_ablation_the_start_is_the_stored_one() -> None:
     assert found.start is stored
     facts = env_builder(compose(["task=hammer-use1"]), open_library()).facts()
     assert not any(name.startswith("ablation") for name in facts)
+
+
+@pytest.mark.usefixtures("library_home")
+def test_what_is_not_as_asked_for_is_told_in_words() -> None:
+    stored, _ = made("duck-lift", "planned", "none")
+    exact = Ablated(stored, 0.15, 0.0, 0.0, 0.0, False, 0.0)
+    assert exact.compromises(0.15) == ""
+    assert exact.compromises(0.25) == "a slide ends 15.0 cm away, not 25.0"
+    off = replace(exact, retreat_m=0.012, finger_error_rad=0.48)
+    assert off.compromises(0.15) == (
+        "the wrist retreats 1.2 cm to touch nothing, fingers stop 0.48 rad short of their pose"
+    )
+    cfg = compose(["task=hammer-strike", "ablation=distance_25cm"])
+    (note,) = env_builder(cfg, open_library()).notes
+    assert note == ("ablation=distance_25cm of hammer-strike: a slide ends 18.6 cm away, not 25.0")
 
 
 @pytest.mark.usefixtures("library_home")

@@ -257,6 +257,11 @@ def test_a_run_from_start_to_table_and_on(library_home: Path, tmp_path: Path) ->
     assert again.code == 0
     assert "finished already" in again.err
     assert again.out == first.out
+    assert "made with" not in again.err
+    path = tmp_path / "run" / "result.json"
+    path.write_text(json.dumps({**result, "asset_source": "registry"}))
+    other = command("pgdm-run", "--offline", *TINY, "run_dir=run", "seed=3")
+    assert "note: it was made with asset_source 'registry', and the library now has" in other.err
 
     longer = [*TINY, "run_dir=run", "seed=3", "total_frames=64"]
     grown = command("pgdm-run", "--offline", *longer)

@@ -73,10 +73,10 @@ def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
         raise ConfigError(f"pregrasp.source '{cfg.source}' is unknown; valid: {', '.join(SOURCES)}")
     if cfg.source == "none":
         return _reset_pose(motion, scene)
-    for source in (cfg.source, cfg.fallback):
-        if source is not None and (found := _stored(source, motion, scene)) is not None:
-            return found
     task, hand = scene.task.id, scene.hand.name
+    source = stored_source(cfg, motion, task, hand)
+    if source is not None:
+        return _stored(source, motion, scene)
     have = [*motion.starts, *pregrasp_file.own(task, hand)]
     raise ConfigError(
         f"task '{task}' has no stored start '{cfg.source}' for hand '{hand}'; it has: "
@@ -94,16 +94,14 @@ def stored_source(cfg: PregraspCfg, motion: Motion, task: str, hand: str) -> str
     return None
 
 
-def _stored(source: str, motion: Motion, scene: Scene) -> StartState | None:
-    """Return the user's own start of a source, else the one stored with the motion, else None."""
+def _stored(source: str, motion: Motion, scene: Scene) -> StartState:
+    """Return the user's own start of a source, else the one that is stored with the motion."""
     task, hand = scene.task.id, scene.hand.name
     own = pregrasp_file.find(task, hand, source)
     if own is not None:
         reach = _reach(own.start, own.pose.qpos, scene)
         start = StartState(source, own.start.qpos, own.start.qvel, own.sha256, reach)
         return _within_limits(_fitting(start, scene), scene)
-    if source not in motion.starts:
-        return None
     stored = motion.starts[source]
     # The plans of R begin with the objects where the mined pre-grasp has them.
     mined = motion.starts.get("mined", stored)
