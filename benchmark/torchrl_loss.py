@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor, nn
 
-from pgdm.rl.learner import PPOCfg
+from pgdm.rl.ppo import PPOCfg
 from pgdm.rl.loss import Samples
 from pgdm.rl.networks import ActorCritic
 

@@ -1,24 +1,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
 from pgdm.errors import RunError
+from pgdm.rl.algos import build_learner
 from pgdm.rl.collector import Collector, torch_threads
-from pgdm.rl.networks import ActorCritic, NetworkCfg, gaussian_log_prob
 from pgdm.rl.vec_env import VecEnv
 from pgdm.seeding import torch_stream
-from toy_envs import FreeEnv, PointEnv, ScriptedEnv
+from toy_envs import TOY, FreeEnv, PointEnv, ScriptedEnv
 
 
 def collector(env: VecEnv, steps: int) -> Collector:
-    cfg = NetworkCfg(env.obs_dim, env.action_dim, [8], -1.0, False, 10.0)
-    made = Collector(
-        env, ActorCritic(cfg, torch_stream(0, "weights")), steps, torch_stream(0, "actions")
-    )
+    learner = build_learner(env, replace(TOY, hidden=[8], minibatch_size=1), 0, 0, "cpu", 1, None)
+    made = Collector(env, learner, steps, torch_stream(0, "actions"))
     made.reset()
     return made
 
@@ -44,13 +43,14 @@ def test_a_rollout_holds_what_happened() -> None:
     assert (t, rows.tolist(), last.tolist()) == (2, [1], [[3.0]])
 
 
-def test_log_probs_are_those_of_the_actions() -> None:
+def test_means_are_those_that_the_actions_were_sampled_around() -> None:
     made = collector(PointEnv(4), 6)
     rollout = made.collect()
-    with torch.no_grad():
-        mean = made.model.mean(rollout.obs[:-1].flatten(0, 1))
-        expected = gaussian_log_prob(mean, made.model.log_std, rollout.action.flatten(0, 1))
-    torch.testing.assert_close(rollout.log_prob.flatten(), expected)
+    model = made.learner.model
+    for t in range(6):
+        expected = model.act(rollout.obs[t], deterministic=True)
+        torch.testing.assert_close(rollout.mean[t], expected)
+    assert (rollout.action != rollout.mean).all()
 
 
 def test_the_next_rollout_goes_on_where_the_last_one_ended() -> None:

@@ -9,11 +9,12 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from pgdm.rl.learner import PPOCfg
+from pgdm.rl.ppo import PPOCfg
 from pgdm.rl.trainer import TrainerCfg
 from pgdm.seeding import torch_stream
 
 PAPER = PPOCfg(
+    learner="ppo",
     name="ppo",
     gamma=0.95,
     gae_lambda=0.95,
@@ -89,7 +90,8 @@ class PointEnv:
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         self._pos = self._pos + 0.2 * action.clamp(-1, 1)
         self._t = self._t + 1
-        reward = self.weights["near"] * -self._pos.norm(dim=1)
+        near = -self._pos.norm(dim=1)
+        reward = self.weights["near"] * near
         self._return = self._return + reward
         terminated = self._t >= 20
         truncated = (self._pos.abs() > 2).any(1) & ~terminated
@@ -97,6 +99,7 @@ class PointEnv:
         info: dict[str, Any] = {
             "final_obs": self._obs(),
             "terms": {"near": reward},
+            "raw_terms": {"near": near},
             "episodes": None,
         }
         if done.any():
@@ -133,6 +136,9 @@ class PointEnv:
 
     def warm_start(self) -> Tensor | None:
         return torch.tensor([0.25, -0.5])
+
+    def reward_weights(self) -> dict[str, float]:
+        return self.weights
 
     def set_weights(self, weights: dict[str, float]) -> None:
         self.weights.update(weights)
@@ -173,7 +179,8 @@ class ScriptedEnv:
         final = self._obs()
         done = self._terminated[t] | self._truncated[t]
         obs = torch.where(done[:, None], -final, final)  # after a restart: the negative
-        info = {"final_obs": final, "terms": {"script": self._reward[t]}, "episodes": None}
+        terms = {"script": self._reward[t]}
+        info = {"final_obs": final, "terms": terms, "raw_terms": terms, "episodes": None}
         return obs, self._reward[t], self._terminated[t], self._truncated[t], info
 
     def _obs(self) -> Tensor:
@@ -187,6 +194,9 @@ class ScriptedEnv:
 
     def warm_start(self) -> Tensor | None:
         return None
+
+    def reward_weights(self) -> dict[str, float]:
+        return {"script": 1.0}
 
     def set_weights(self, weights: dict[str, float]) -> None:
         pass
@@ -208,5 +218,7 @@ class FreeEnv(ScriptedEnv):
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         self.t += 1
         obs = self._obs()
-        info = {"final_obs": obs, "terms": {}, "episodes": None}
-        return obs, self._rewards[self.t % 16], self._no, self._no, info
+        reward = self._rewards[self.t % 16]
+        terms = {"script": reward}
+        info = {"final_obs": obs, "terms": terms, "raw_terms": terms, "episodes": None}
+        return obs, reward, self._no, self._no, info

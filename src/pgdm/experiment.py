@@ -36,6 +36,9 @@ _log = logging.getLogger(__name__)
 
 Notify = Callable[[str], None]
 
+REPLAY = "replay"
+"""Folder of a run in which an off-policy learner keeps what it saw."""
+
 
 @dataclass(frozen=True)
 class RunResult:
@@ -102,8 +105,11 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
 def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
     """Return sentences on what in a run is not as one might think."""
     late = builder.mdp.recipe.unfinished(cfg.total_frames)
+    disk = cfg.algo.disk_bytes(builder.make(cfg.num_envs, 1), cfg.total_frames)
+    kept = "it is kept" if cfg.keep_replay else "removed when the run has finished"
     return [
         *builder.notes,
+        *([f"the replay takes {disk / 1e9:.2f} GB of disk; {kept}"] if disk else []),
         *(
             f"the weight of '{name}' only comes to {last:.3g} of {weight:g} in "
             f"{cfg.total_frames:,} frames: its schedule is longer than the run"
@@ -258,6 +264,8 @@ class Run(Callback):
             schedules=self.builder.mdp.recipe.schedules,
             callbacks=callbacks,
             stop=stop,
+            replay_folder=self.dir / REPLAY,
+            keep_replay=cfg.keep_replay,
             metadata={**self.builder.facts(), "versions": versions()},
         )
         return Trainer(env, trainer_cfg, extras)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # it loads the simulator and torch
 _BESIDE = (
     "run_dir",
     "resume",
+    "keep_replay",
     "offline",
     "budget",
     "num_threads",  # simulations do not depend on it

@@ -15,9 +15,10 @@ from pgdm.methods import MethodCfg, config_class, recipe
 from pgdm.motion.reference import FRAMES, ReferenceCfg
 from pgdm.pregrasp.ablate import AblationCfg
 from pgdm.pregrasp.sources import SOURCES, PregraspCfg
+from pgdm.rl.algos import algo_class
 from pgdm.rl.checkpoint import CheckpointCfg
 from pgdm.rl.evaluate import EvalCfg
-from pgdm.rl.learner import PPOCfg, check_batch
+from pgdm.rl.learner import AlgoCfg
 from pgdm.sim.scene import HandCfg, SimCfg, TaskCfg
 from pgdm.tracking import TRACKERS, TrackingCfg
 
@@ -42,7 +43,7 @@ class ExperimentCfg:
     """What an action means."""
     reference: ReferenceCfg
     """How the stored motion becomes targets."""
-    algo: PPOCfg
+    algo: Annotated[AlgoCfg, ChosenBy("learner", algo_class)]
     """How the policy learns."""
     sim: SimCfg
     """Solver settings."""
@@ -68,6 +69,8 @@ class ExperimentCfg:
     """A run that exists: ``auto`` continues it, ``must`` demands one, ``never`` refuses."""
     budget: str
     """Label for reports, such as smoke, reduced or paper."""
+    keep_replay: bool
+    """Whether an off-policy learner's replay stays in the folder of a run that has finished."""
     offline: bool
     """Whether missing assets are an error instead of being fetched."""
 
@@ -81,7 +84,7 @@ class ExperimentCfg:
         _check_choices(flat)
         _check_ranges(flat)
         self.method.validate()
-        check_batch(self.algo, self.num_envs)
+        self.algo.check(self.num_envs)
         self.ablation.check(self.pregrasp.source)
         self._check_hand()
         self._check_expert()
@@ -168,6 +171,11 @@ _AT_LEAST: dict[str, int] = {
     "algo.steps_per_env": 1,
     "algo.minibatch_size": 1,
     "algo.epochs": 1,
+    "algo.batch_size": 1,
+    "algo.critics": 1,
+    "algo.updates_per_step": 1,
+    "algo.actor_interval": 1,
+    "algo.warmup_steps": 1,
     "sim.solver_iterations": 1,
     "sim.noslip_iterations": 0,
     "eval.episodes": 1,
@@ -181,9 +189,11 @@ _ABOVE_ZERO = (
     "algo.clip",
     "algo.max_grad_norm",
     "algo.observation_clip",
+    "algo.reward_scale",
+    "algo.temperature_init",
     "checkpoint.interval_s",
 )
-_SHARES = ("algo.gamma", "algo.gae_lambda")
+_SHARES = ("algo.gamma", "algo.gae_lambda", "algo.target_rate")
 
 
 def _check_choices(flat: dict[str, object]) -> None:
@@ -195,14 +205,15 @@ def _check_choices(flat: dict[str, object]) -> None:
 
 def _check_ranges(flat: dict[str, object]) -> None:
     numbers = {k: v for k, v in flat.items() if isinstance(v, int | float)}
+    # Each learner has numbers of its own.
     for key, low in _AT_LEAST.items():
-        if numbers[key] < low:
+        if numbers.get(key, low) < low:
             raise ConfigError(f"{key} is {numbers[key]}; it must be at least {low}")
     for key in _ABOVE_ZERO:
-        if numbers[key] <= 0:
+        if numbers.get(key, 1) <= 0:
             raise ConfigError(f"{key} is {numbers[key]}; it must be above 0")
     for key in _SHARES:
-        if not 0 <= numbers[key] <= 1:
+        if not 0 <= numbers.get(key, 0) <= 1:
             raise ConfigError(f"{key} is {numbers[key]}; it must be between 0 and 1")
     hidden = flat["algo.hidden"]
     if isinstance(hidden, list) and any(width < 1 for width in hidden):

@@ -194,6 +194,10 @@ class BatchEnv:
                 raise UnknownNameError("reward term", name, self._names)
             self._weights[self._names.index(name)] = weight
 
+    def reward_weights(self) -> dict[str, float]:
+        """Return the weight of each reward term now."""
+        return dict(zip(self._names, self._weights[:, 0].tolist(), strict=True))
+
     def object_error(self) -> Tensor:
         """Return the object's current distance from its target, (N,) m."""
         return self._context(self.sim.read()).object_error

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from pgdm.errors import RunError
-from pgdm.rl.networks import ActorCritic, gaussian_log_prob
-from pgdm.rl.vec_env import Finished, VecEnv
+from pgdm.rl.vec_env import Finished, VecEnv, VecStep
+
+if TYPE_CHECKING:
+    from pgdm.rl.learner import Learner
 
 
 @contextmanager
@@ -31,6 +34,20 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+@dataclass(frozen=True)
+class Step:
+    """One control step of N simulations."""
+
+    obs: Tensor
+    """(N, D) observations that were acted upon."""
+    action: Tensor
+    """(N, A) actions as sampled."""
+    terminated: Tensor
+    """(N,) bool, nothing came after."""
+    info: dict[str, Any]
+    """As the environment gave it: ``final_obs``, ``raw_terms`` and more."""
+
+
 @dataclass
 class Rollout:
     """T steps of N simulations. The tensors are reused by the next iteration."""
@@ -39,8 +56,8 @@ class Rollout:
     """(T + 1, N, D) observations as the environment gave them; the last are those to go on from."""
     action: Tensor
     """(T, N, A) actions as sampled."""
-    log_prob: Tensor
-    """(T, N) their log-probabilities."""
+    mean: Tensor
+    """(T, N, A) the policy's means that they were sampled around."""
     reward: Tensor
     """(T, N) rewards."""
     terminated: Tensor
@@ -59,7 +76,7 @@ class Rollout:
         return cls(
             obs=torch.zeros(steps + 1, n, env.obs_dim),
             action=torch.zeros(steps, n, env.action_dim),
-            log_prob=torch.zeros(steps, n),
+            mean=torch.zeros(steps, n, env.action_dim),
             reward=torch.zeros(steps, n),
             terminated=torch.zeros(steps, n, dtype=torch.bool),
             truncated=torch.zeros(steps, n, dtype=torch.bool),
@@ -81,22 +98,24 @@ class Rollout:
 
 
 class Collector:
-    """Steps the environment with the policy and fills one rollout after the other.
+    """Steps the environment with a learner's policy and fills one rollout after the other.
 
     Args:
         env: the environment.
-        model: the policy that acts.
+        learner: whose policy acts; it may work beside each step and takes in what came of it.
         steps: T, steps of each simulation in a rollout.
         generator: stream of the action noise.
     """
 
     def __init__(
-        self, env: VecEnv, model: ActorCritic, steps: int, generator: torch.Generator
+        self, env: VecEnv, learner: Learner, steps: int, generator: torch.Generator
     ) -> None:
-        self.env, self.model = env, model
+        self.env, self.learner = env, learner
         self.steps, self.generator = steps, generator
         self._rollout = Rollout.empty(steps, env)
-        self._mean = torch.zeros_like(self._rollout.action)
+        # The policy that acts never waits for the learner's work beside the step before: whether
+        # both really happen at the same time changes nothing but the speed.
+        self._physics = ThreadPoolExecutor(1, "pgdm-physics") if learner.overlaps else None
 
     @property
     def frames(self) -> int:
@@ -116,27 +135,32 @@ class Collector:
         rollout = self._rollout
         rollout.obs[0] = rollout.obs[-1].clone()
         rollout.last_obs, rollout.finished = [], []
-        with torch_threads(1), torch.no_grad():
+        with torch_threads(1):
             for t in range(self.steps):
                 self._step(rollout, t)
-            # All at once: many small operations between two steps of the physics cost more.
-            log_std = self.model.log_std.cpu()
-            rollout.log_prob = gaussian_log_prob(self._mean, log_std, rollout.action)
         return rollout
 
     def _step(self, rollout: Rollout, t: int) -> None:
-        rollout.action[t], self._mean[t] = self.model.sample(rollout.obs[t], self.generator)
-        obs, reward, terminated, truncated, info = self.env.step(rollout.action[t])
+        acted_on, action = rollout.obs[t], rollout.action[t]
+        rollout.action[t], rollout.mean[t] = self.learner.model.sample(acted_on, self.generator)
+        result = self._aside(lambda: self.env.step(action))
+        self.learner.during_step()
+        obs, reward, terminated, truncated, info = result()
         rollout.obs[t + 1], rollout.reward[t] = obs, reward
         rollout.terminated[t], rollout.truncated[t] = terminated, truncated
         # A sum is finite only if all its parts are, and costs a tenth of looking at each.
         if not math.isfinite(float(reward.sum()) + float(obs.sum())):
             _check_finite(t, obs, reward, info)
+        self.learner.after_step(Step(acted_on, action, terminated, info))
         if truncated.any():
             rows = truncated.nonzero()[:, 0]
             rollout.last_obs.append((t, rows, info["final_obs"][rows].clone()))
         if info["episodes"] is not None:
             rollout.finished.append(info["episodes"])
+
+    def _aside(self, work: Callable[[], VecStep]) -> Callable[[], VecStep]:
+        """Start work in the other thread, if there is one; call the result for its result."""
+        return work if self._physics is None else self._physics.submit(work).result
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the next rollout depends on, the policy aside."""

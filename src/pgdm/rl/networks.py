@@ -1,4 +1,4 @@
-"""The policy and the value function, two separate networks."""
+"""Policies and value functions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from pgdm.rl.normalizer import Normalizer
 
 # Gains of stable-baselines3, which trained the paper's policies.
 _HIDDEN_GAIN, _MEAN_GAIN, _VALUE_GAIN = math.sqrt(2), 0.01, 1.0
+_NO_GENERATOR = "sampling an action needs a generator; pass one or deterministic=True"
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+_LOG_STD_RANGE = (-5.0, 1.0)  # of a squashed policy, before the squashing
+_WARM_START_LIMIT = 0.95  # beyond it tanh is so flat that nothing would be learned
 
 
 @dataclass(frozen=True)
@@ -132,8 +135,125 @@ class ActorCritic(nn.Module):
         if deterministic:
             return self.mean(self.normalize(obs.to(self.device))).cpu()
         if generator is None:
-            raise RunError("sampling an action needs a generator; pass one or deterministic=True")
+            raise RunError(_NO_GENERATOR)
         return self.sample(obs, generator)[0].cpu()
+
+
+@dataclass(frozen=True)
+class SquashedCfg:
+    """What is needed to build the policy that an off-policy checkpoint's weights fit into."""
+
+    kind: str
+    """``squashed``, which tells it from a ``NetworkCfg``."""
+    obs_dim: int
+    """D, numbers in an observation."""
+    action_dim: int
+    """A, numbers in an action."""
+    hidden: list[int]
+    """Widths of the hidden layers."""
+    log_std_init: float
+    """Log of the standard deviation at the start, before the squashing."""
+    observation_clip: float
+    """Standardised observations are clipped here, standard deviations."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings as plain values."""
+        return asdict(self)
+
+
+class SquashedPolicy(nn.Module):
+    """A Gaussian whose mean and deviation depend on the observation, squashed by tanh to (-1, 1).
+
+    Args:
+        cfg: sizes and start values.
+        generator: stream of the initial weights; None leaves them uninitialised.
+        mean_bias: start (A,) of the squashed mean, or None for 0.
+    """
+
+    def __init__(
+        self,
+        cfg: SquashedCfg,
+        generator: torch.Generator | None = None,
+        mean_bias: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.cfg = cfg
+        self.normalizer = Normalizer(cfg.obs_dim, cfg.observation_clip)
+        self.net = silu_mlp(cfg.obs_dim, cfg.hidden, 2 * cfg.action_dim, generator)
+        last = self.net[-1]
+        assert isinstance(last, nn.Linear)
+        if generator is not None:
+            with torch.no_grad():
+                last.weight.mul_(_MEAN_GAIN)
+                last.bias[: cfg.action_dim] = 0.0
+                last.bias[cfg.action_dim :] = cfg.log_std_init
+        if mean_bias is not None:
+            limit = _WARM_START_LIMIT
+            with torch.no_grad():
+                last.bias[: cfg.action_dim] = mean_bias.clamp(-limit, limit).atanh()
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return next(self.net.parameters()).device
+
+    def forward(self, normalized: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and deviation before the squashing, (M, A) each, at (M, D) normalised."""
+        mean, log_std = self.net(normalized).float().chunk(2, -1)
+        return mean, log_std.clamp(*_LOG_STD_RANGE).exp()
+
+    @torch.no_grad()
+    def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Draw actions (N, A) at raw observations (N, D); return them and the squashed means."""
+        mean, std = self(self.normalizer(obs.to(self.device)))
+        noise = torch.randn(mean.shape, generator=generator).to(self.device)
+        return torch.tanh(mean + std * noise), torch.tanh(mean)
+
+    @torch.no_grad()
+    def act(
+        self, obs: Tensor, generator: torch.Generator | None = None, deterministic: bool = False
+    ) -> Tensor:
+        """Return actions (N, A) on the CPU for raw observations (N, D); see `ActorCritic.act`.
+
+        Raises:
+            RunError: if a sample is wanted without a generator.
+        """
+        if generator is None and not deterministic:
+            raise RunError(_NO_GENERATOR)
+        if generator is None or deterministic:
+            return torch.tanh(self(self.normalizer(obs.to(self.device)))[0]).cpu()
+        return self.sample(obs, generator)[0].cpu()
+
+
+class ActionValue(nn.Module):
+    """The discounted return (M, 1) expected after an action (M, A) at a normalised (M, D)."""
+
+    def __init__(
+        self, obs_dim: int, action_dim: int, hidden: Sequence[int], generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.net = silu_mlp(obs_dim + action_dim, hidden, 1, generator)
+
+    def forward(self, normalized: Tensor, action: Tensor) -> Tensor:
+        """Return the value, (M, 1)."""
+        return self.net(torch.cat((normalized, action), -1)).float()
+
+
+def silu_mlp(
+    inputs: int, hidden: Sequence[int], outputs: int, generator: torch.Generator | None
+) -> nn.Sequential:
+    """Return hidden layers with layer norm and SiLU, weights uniform in +-1/sqrt(fan-in)."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [_linear(inputs, width), nn.LayerNorm(width), nn.SiLU()]
+        inputs = width
+    net = nn.Sequential(*layers, _linear(inputs, outputs))
+    if generator is not None:
+        for layer in (m for m in net if isinstance(m, nn.Linear)):
+            bound = 1 / math.sqrt(layer.in_features)
+            nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
+            nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
+    return net
 
 
 def _mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:

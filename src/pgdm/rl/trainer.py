@@ -5,21 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
-import torch
-
 from pgdm.errors import CheckpointError
+from pgdm.rl.algos import build_learner
 from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder, State
 from pgdm.rl.collector import Collector
 from pgdm.rl.evaluate import Policy
-from pgdm.rl.learner import Learner, PPOCfg, check_batch
-from pgdm.rl.networks import ActorCritic, NetworkCfg
+from pgdm.rl.learner import AlgoCfg, Model
 from pgdm.rl.vec_env import VecEnv
 from pgdm.seeding import torch_stream
-
-__all__ = ["Evaluation", "Extras", "Outcome", "PPOCfg", "Trainer", "TrainerCfg"]
 
 Schedule = Callable[[int], dict[str, float]]
 """From environment steps so far to reward weights by term name."""
@@ -37,8 +34,8 @@ class Evaluation(Protocol):
 class TrainerCfg:
     """A training, apart from its environment."""
 
-    algo: PPOCfg
-    """Settings of PPO."""
+    algo: AlgoCfg
+    """Settings of the learner, whose class chooses it."""
     seed: int
     """The run's seed."""
     total_frames: int
@@ -67,6 +64,10 @@ class Extras:
     """Listen."""
     stop: Callable[[], bool] = lambda: False
     """Asked at safe points; True ends the training as ``interrupted``."""
+    replay_folder: Path | None = None
+    """Where an off-policy learner keeps what it saw; None: in memory, and not to be resumed."""
+    keep_replay: bool = False
+    """Whether that is kept when the training has finished."""
     metadata: dict[str, Any] = field(default_factory=dict)
     """Plain values stored in each checkpoint, such as what identifies the run."""
 
@@ -84,7 +85,7 @@ class Outcome:
 
 
 class Trainer:
-    """Trains a policy on an environment with PPO.
+    """Trains a policy on an environment, with the learner that ``cfg.algo`` is for.
 
     Everything that is random comes from named streams of ``cfg.seed``, and ``state_dict`` holds
     all that the next iteration depends on: a training that was stopped and restored equals one
@@ -100,15 +101,18 @@ class Trainer:
     """
 
     def __init__(self, env: VecEnv, cfg: TrainerCfg, extras: Extras | None = None) -> None:
-        check_batch(cfg.algo, env.num_envs)
         self.env, self.cfg, self.extras = env, cfg, extras or Extras()
-        self.model = _build_model(env, cfg)
-        threads = cfg.num_threads or torch.get_num_threads()
-        self._collector = Collector(
-            env, self.model, cfg.algo.steps_per_env, torch_stream(cfg.seed, "actions")
+        self._learner = build_learner(
+            env,
+            cfg.algo,
+            cfg.seed,
+            cfg.total_frames,
+            cfg.device,
+            cfg.num_threads,
+            self.extras.replay_folder,
         )
-        self._learner = Learner(
-            self.model, cfg.algo, torch_stream(cfg.seed, "minibatches"), threads
+        self._collector = Collector(
+            env, self._learner, cfg.algo.steps_per_env, torch_stream(cfg.seed, "actions")
         )
         self._frames, self._iteration, self._elapsed_s = 0, 0, 0.0
         self._evaluated_at = -1
@@ -117,6 +121,11 @@ class Trainer:
         self._restored = False
         self._clock = self._saved_at = time.monotonic()
         self._saved_state: tuple[int, int] | None = None
+
+    @property
+    def model(self) -> Model:
+        """The policy that is measured."""
+        return self._learner.evaluated
 
     @property
     def progress(self) -> Progress:
@@ -147,6 +156,8 @@ class Trainer:
                 return "interrupted"
             if self._frames >= self.cfg.total_frames:
                 self._save()
+                if not self.extras.keep_replay:
+                    self._learner.finish()
                 return "finished"
             if time.monotonic() - self._saved_at >= self.cfg.checkpoint_interval_s:
                 self._save()
@@ -223,7 +234,7 @@ class Trainer:
     def state_dict(self) -> State:
         """Return all that the rest of the training depends on, tensors and plain values only."""
         return {
-            "network": self.model.cfg.as_dict(),
+            "network": self._learner.model.cfg.as_dict(),
             "learner": self._learner.state_dict(),
             "collector": self._collector.state_dict(),
             "frames": self._frames,
@@ -241,7 +252,7 @@ class Trainer:
         Raises:
             CheckpointError: if the state is of other networks or lacks a part.
         """
-        mine, other = self.model.cfg.as_dict(), state.get("network", {})
+        mine, other = self._learner.model.cfg.as_dict(), state.get("network", {})
         wrong = [name for name in mine if mine[name] != other.get(name)]
         if wrong:
             raise CheckpointError(
@@ -258,17 +269,3 @@ class Trainer:
         except (KeyError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"the checkpoint does not fit this run: {error}") from error
         self._restored, self._saved_state = True, (self._frames, self._evaluated_at)
-
-
-def _build_model(env: VecEnv, cfg: TrainerCfg) -> ActorCritic:
-    algo = cfg.algo
-    network = NetworkCfg(
-        obs_dim=env.obs_dim,
-        action_dim=env.action_dim,
-        hidden=list(algo.hidden),
-        log_std_init=algo.log_std_init,
-        normalize_observations=algo.normalize_observations,
-        observation_clip=algo.observation_clip,
-    )
-    bias = env.warm_start() if algo.warm_start else None
-    return ActorCritic(network, torch_stream(cfg.seed, "weights"), bias).to(cfg.device)

@@ -48,7 +48,8 @@ class VecEnv(Protocol):
             obs (N, D) float32, of finished rows those after the restart; reward (N,) float32;
             terminated (N,) bool; truncated (N,) bool; info with ``final_obs`` (N, D), the true
             last observations, ``episodes``, those that finished (`Finished`) in the order of
-            their rows, or None, and ``terms`` {name: (N,)} weighted reward terms.
+            their rows, or None, and {name: (N,)} of the reward terms, ``raw_terms`` before and
+            ``terms`` after weighting.
         """
         ...
 
@@ -62,6 +63,10 @@ class VecEnv(Protocol):
 
     def warm_start(self) -> Tensor | None:
         """Return the action (A,) a policy's mean should start from, or None."""
+        ...
+
+    def reward_weights(self) -> dict[str, float]:
+        """Return the weight of each reward term now, in the order of ``raw_terms``."""
         ...
 
     def set_weights(self, weights: dict[str, float]) -> None:

@@ -8,35 +8,36 @@ import pytest
 import torch
 
 from pgdm.errors import ConfigError, RunError
-from pgdm.rl import learner as learner_module
+from pgdm.rl import ppo as ppo_module
 from pgdm.rl.collector import Collector, Rollout
-from pgdm.rl.learner import Learner, PPOCfg, check_batch, explained_variance
 from pgdm.rl.networks import ActorCritic, NetworkCfg
+from pgdm.rl.ppo import PPOCfg, PPOLearner, check_batch, explained_variance
 from pgdm.rl.vec_env import VecEnv
 from pgdm.seeding import torch_stream
 from toy_envs import PAPER, TOY, PointEnv, ScriptedEnv
 
 
-def build(env: VecEnv, cfg: PPOCfg, num_threads: int = 1) -> tuple[Learner, Collector]:
+def build(env: VecEnv, cfg: PPOCfg, num_threads: int = 1) -> tuple[PPOLearner, Collector]:
     network = NetworkCfg(
         env.obs_dim, env.action_dim, cfg.hidden, cfg.log_std_init, cfg.normalize_observations, 10.0
     )
     model = ActorCritic(network, torch_stream(0, "weights"))
-    collector = Collector(env, model, cfg.steps_per_env, torch_stream(0, "actions"))
+    learner = PPOLearner(model, cfg, torch_stream(0, "minibatches"), num_threads)
+    collector = Collector(env, learner, cfg.steps_per_env, torch_stream(0, "actions"))
     collector.reset()
-    return Learner(model, cfg, torch_stream(0, "minibatches"), num_threads), collector
+    return learner, collector
 
 
 def test_each_sample_is_visited_once_in_each_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
     learner, collector = build(PointEnv(8), TOY)
     visited: list[torch.Tensor] = []
-    real = learner_module.policy_loss
+    real = ppo_module.policy_loss
 
     def watch(*args: Any, **settings: Any) -> Any:
         visited.append(args[2].obs)
         return real(*args, **settings)
 
-    monkeypatch.setattr(learner_module, "policy_loss", watch)
+    monkeypatch.setattr(ppo_module, "policy_loss", watch)
     rollout = collector.collect()
     learner.learn(rollout)
     samples = rollout.obs[:-1].flatten(0, 1)
@@ -126,7 +127,7 @@ def test_the_number_of_threads_does_not_change_a_bit() -> None:
 def test_a_loss_that_is_not_finite_is_named_and_changes_nothing() -> None:
     learner, collector = build(PointEnv(8), TOY)
     rollout = collector.collect()
-    rollout.log_prob[:] = -math.inf  # ratios become infinite
+    rollout.mean[:] = math.inf  # the actions had no probability, so ratios become infinite
     before = {name: value.clone() for name, value in learner.model.state_dict().items()}
     with pytest.raises(RunError, match=r"^loss_policy is not finite .*last checkpoint is good"):
         learner.learn(rollout)

@@ -1,0 +1,60 @@
+"""The learners there are, by the name in ``algo.learner``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from pgdm.errors import UnknownNameError
+from pgdm.rl.learner import AlgoCfg, Learner
+from pgdm.rl.ppo import PPOCfg, PPOLearner, build_model
+from pgdm.rl.sac import SACCfg, SACLearner
+from pgdm.rl.vec_env import VecEnv
+from pgdm.seeding import torch_stream
+
+ALGOS: dict[str, type[AlgoCfg]] = {"ppo": PPOCfg, "sac": SACCfg}
+
+
+def algo_class(name: str) -> type[AlgoCfg]:
+    """Return the class of a learner's settings.
+
+    Raises:
+        UnknownNameError: if there is no such learner.
+    """
+    if name not in ALGOS:
+        raise UnknownNameError("algo.learner", name, ALGOS)
+    return ALGOS[name]
+
+
+def build_learner(
+    env: VecEnv,
+    cfg: AlgoCfg,
+    seed: int,
+    total_frames: int,
+    device: str,
+    num_threads: int,
+    replay_folder: Path | None,
+) -> Learner:
+    """Return a new learner for an environment.
+
+    Args:
+        env: what its policy acts in.
+        cfg: its settings.
+        seed: the run's seed.
+        total_frames: length of the training.
+        device: where the networks are.
+        num_threads: threads of torch; 0: as many as torch takes by itself.
+        replay_folder: where an off-policy learner keeps what it saw, or None for in memory.
+
+    Raises:
+        ConfigError: if the settings do not fit the number of simulations.
+        RunError: if there is no room for the replay.
+    """
+    cfg.check(env.num_envs)
+    threads = num_threads or torch.get_num_threads()
+    if isinstance(cfg, SACCfg):
+        return SACLearner(env, cfg, seed, total_frames, replay_folder, device, threads)
+    assert isinstance(cfg, PPOCfg)
+    model = build_model(env, cfg, seed, device)
+    return PPOLearner(model, cfg, torch_stream(seed, "minibatches"), threads)

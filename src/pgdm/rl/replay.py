@@ -1,0 +1,175 @@
+"""The replay: every frame of a run, in append-only files of its folder."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import warnings
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pgdm.errors import CheckpointError, RunError
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # torchrl's compiled part, unused here, is of another torch
+    from tensordict import MemoryMappedTensor, TensorDict
+    from torchrl.data import TensorDictReplayBuffer, TensorStorage
+
+_SUFFIX = ".bin"
+
+
+@dataclass(frozen=True)
+class Column:
+    """One number or vector of every frame."""
+
+    dtype: torch.dtype
+    shape: tuple[int, ...] = ()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of one frame."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+class Replay:
+    """Frames in the order in which they were seen, sampled uniformly.
+
+    A column is one file. Files are reserved in full at the start, so that a disk without room is
+    an error then and not in the middle of a training; what was appended survives the death of the
+    process. A checkpoint holds the number of frames and a checksum of each column instead of a
+    copy: whatever was appended after it is written over when the run goes on.
+
+    Args:
+        columns: what a frame consists of, by name.
+        capacity: frames there is room for.
+        batch_size: frames in a sample.
+        generator: stream of the sampled rows.
+        folder: where the files are, or None to keep the frames in memory.
+
+    Raises:
+        RunError: if the disk has no room for the files.
+    """
+
+    def __init__(
+        self,
+        columns: Mapping[str, Column],
+        capacity: int,
+        batch_size: int,
+        generator: torch.Generator,
+        folder: Path | None = None,
+    ) -> None:
+        self.columns, self.capacity, self.folder = dict(columns), capacity, folder
+        if folder is None:
+            data = {n: torch.zeros(capacity, *c.shape, dtype=c.dtype) for n, c in columns.items()}
+        else:
+            _reserve(folder, self.columns, capacity)
+            data = {
+                name: MemoryMappedTensor.from_filename(
+                    str(folder / f"{name}{_SUFFIX}"), c.dtype, torch.Size((capacity, *c.shape))
+                )
+                for name, c in columns.items()
+            }
+        self._data = TensorDict(data, batch_size=[capacity])
+        self._buffer = TensorDictReplayBuffer(
+            storage=TensorStorage(self._data), generator=generator, batch_size=batch_size
+        )
+        self._crc = dict.fromkeys(columns, 0)
+        self._set_length(0)
+
+    def __len__(self) -> int:
+        """Return the number of frames so far."""
+        return len(self._buffer)
+
+    def append(self, frames: Mapping[str, Tensor]) -> None:
+        """Add n frames, each column (n, ...).
+
+        Raises:
+            RunError: if there is no room for them.
+        """
+        count = len(next(iter(frames.values())))
+        if len(self) + count > self.capacity:
+            raise RunError(f"the replay has room for {self.capacity:,} frames; it is full")
+        rows = {
+            name: frames[name].to(column.dtype).contiguous()
+            for name, column in self.columns.items()
+        }
+        self._buffer.extend(TensorDict(rows, batch_size=[count]))
+        for name, values in rows.items():
+            self._crc[name] = zlib.crc32(values.numpy().data, self._crc[name])
+
+    def sample(self) -> TensorDict:
+        """Return ``batch_size`` frames drawn uniformly, with replacement, all floats as float32."""
+        drawn = self._buffer.sample()
+        return drawn.apply(lambda x: x.float() if x.dtype == torch.float16 else x)
+
+    def sync(self) -> None:
+        """Wait until the disk has all frames, so that a checkpoint never tells of others."""
+        for path in self._files():
+            with open(path, "rb") as file:
+                os.fsync(file.fileno())
+
+    def remove(self) -> None:
+        """Delete the files."""
+        if self.folder is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return how many frames there are, and the checksum of each column."""
+        self.sync()
+        return {"frames": len(self), "crc32": dict(self._crc)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from the first ``frames`` frames of the files.
+
+        Raises:
+            CheckpointError: if the files do not hold these frames.
+        """
+        frames, expected = int(state["frames"]), state["crc32"]
+        where = self.folder or "the memory"
+        if frames > self.capacity:
+            raise CheckpointError(
+                f"the checkpoint has {frames:,} frames, {where} {self.capacity:,}"
+            )
+        for name in self.columns:
+            found = zlib.crc32(self._data.get(name)[:frames].numpy().data)
+            if found != expected.get(name):
+                raise CheckpointError(
+                    f"the replay in {where} does not hold the {frames:,} frames that the "
+                    f"checkpoint was made with (column '{name}' differs): it was cut, altered, "
+                    "removed at the end of the run, or is of another run; restore it, or start "
+                    "anew in another run_dir"
+                )
+        self._crc = {name: int(expected[name]) for name in self.columns}
+        self._set_length(frames)
+
+    def _set_length(self, frames: int) -> None:
+        storage = {"_storage": {}, "initialized": True, "_len": frames}
+        self._buffer.storage.load_state_dict(storage)
+        self._buffer.writer.load_state_dict({"_cursor": frames % self.capacity})
+
+    def _files(self) -> list[Path]:
+        return [] if self.folder is None else sorted(self.folder.glob(f"*{_SUFFIX}"))
+
+
+def _reserve(folder: Path, columns: Mapping[str, Column], capacity: int) -> None:
+    """Make each column's file as large as it will be; what is in it stays."""
+    needed = capacity * sum(column.nbytes for column in columns.values())
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, column in columns.items():
+            with open(folder / f"{name}{_SUFFIX}", "ab") as file:
+                os.posix_fallocate(file.fileno(), 0, column.nbytes * capacity)
+    except OSError as error:
+        free = shutil.disk_usage(folder if folder.is_dir() else folder.parent).free
+        raise RunError(
+            f"cannot reserve {needed / 1e9:.1f} GB for the replay in {folder} "
+            f"({free / 1e9:.1f} GB free): {error.strerror or error}; make room, or choose fewer "
+            "total_frames or another run_dir"
+        ) from error

@@ -1,0 +1,284 @@
+"""Soft actor-critic: learns from every frame many times, out of a replay."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from pgdm.errors import RunError
+from pgdm.rl.collector import Rollout, Step, torch_threads
+from pgdm.rl.learner import AlgoCfg
+from pgdm.rl.networks import ActionValue, SquashedCfg, SquashedPolicy
+from pgdm.rl.vec_env import VecEnv
+from pgdm.seeding import torch_stream
+
+if TYPE_CHECKING:  # torchrl takes 4 s to import
+    from pgdm.rl.replay import Column
+
+
+@dataclass(frozen=True)
+class SACCfg(AlgoCfg):
+    """Settings of soft actor-critic; ``conf/algo/sac.yaml`` has them with their reasons."""
+
+    reward_scale: float
+    """Rewards are multiplied by it before they are learned from."""
+    adam_betas: list[float]
+    """Adam's two decay rates, (2,) each 0..1."""
+    critics: int
+    """Number of critics; the lowest one counts."""
+    target_rate: float
+    """Share of the critics that their targets take over in each update, 0..1."""
+    batch_size: int
+    """M, frames in one update."""
+    updates_per_step: int
+    """Updates of the critics per control step of all simulations."""
+    actor_interval: int
+    """The policy learns in every so manieth update."""
+    target_entropy: float
+    """Entropy of the policy that the temperature steers to, nat per action entry."""
+    temperature_init: float
+    """Weight of the entropy in the return at the start."""
+    warmup_steps: int
+    """Control steps of all simulations before the first update."""
+    bfloat16: bool
+    """Whether matrix products are computed in bfloat16."""
+
+    def capacity(self, num_envs: int, total_frames: int) -> int:
+        """Return the frames of a training, whose last iteration is completed."""
+        per_iteration = num_envs * self.steps_per_env
+        return -(-total_frames // per_iteration) * per_iteration
+
+    def disk_bytes(self, env: VecEnv, total_frames: int) -> int:
+        """Return the size of the replay, bytes."""
+        frame = sum(column.nbytes for column in columns(env).values())
+        return frame * self.capacity(env.num_envs, total_frames)
+
+
+class SACLearner:
+    """Holds networks, targets, temperature, optimisers and the replay.
+
+    Beside each step of the simulations it takes ``updates_per_step`` updates on what was seen
+    before. On one thread: a second one serves the physics better than it serves these products.
+
+    Args:
+        env: what the policy acts in, for sizes, reward terms and warm start.
+        cfg: settings.
+        seed: the run's seed.
+        total_frames: length of the training.
+        replay_folder: where the replay is kept, or None to keep it in memory.
+        device: where the networks are.
+        num_threads: more than one lets updates and physics overlap.
+    """
+
+    def __init__(
+        self,
+        env: VecEnv,
+        cfg: SACCfg,
+        seed: int,
+        total_frames: int,
+        replay_folder: Path | None,
+        device: str,
+        num_threads: int,
+    ) -> None:
+        from pgdm.rl.replay import Replay
+        from pgdm.rl.sac_loss import SoftActorCriticLoss, SoftUpdate
+
+        self.cfg, self._env = cfg, env
+        self.overlaps = num_threads > 1
+        weights = torch_stream(seed, "weights")
+        network = SquashedCfg(
+            kind="squashed",
+            obs_dim=env.obs_dim,
+            action_dim=env.action_dim,
+            hidden=list(cfg.hidden),
+            log_std_init=cfg.log_std_init,
+            observation_clip=cfg.observation_clip,
+        )
+        bias = env.warm_start() if cfg.warm_start else None
+        self.model = SquashedPolicy(network, weights, bias).to(device)
+        critics = [
+            ActionValue(env.obs_dim, env.action_dim, cfg.hidden, weights).to(device)
+            for _ in range(cfg.critics)
+        ]
+        self._actions = torch_stream(seed, "policy")
+        self._loss = SoftActorCriticLoss(
+            self.model,
+            critics,
+            gamma=cfg.gamma,
+            temperature=cfg.temperature_init,
+            target_entropy=cfg.target_entropy * env.action_dim,
+            generator=self._actions,
+        )
+        self._targets = SoftUpdate(self._loss, tau=cfg.target_rate)
+        self._critic_params = list(self._loss.qvalue_network_params.parameters())
+        self._policy_params = list(self._loss.actor_network_params.parameters())
+        self._optimizers = {
+            "critics": self._adam(self._critic_params),
+            "policy": self._adam(self._policy_params),
+            "temperature": self._adam([self._loss.log_alpha]),
+        }
+        self._samples = torch_stream(seed, "replay")
+        self._replay = Replay(
+            columns(env),
+            cfg.capacity(env.num_envs, total_frames),
+            cfg.batch_size,
+            self._samples,
+            replay_folder,
+        )
+        self._updates = 0
+        self._logged: list[dict[str, Tensor]] = []
+
+    @property
+    def evaluated(self) -> SquashedPolicy:
+        """The policy that is measured."""
+        return self.model
+
+    def during_step(self) -> None:
+        """Take the updates of one step.
+
+        Raises:
+            RunError: if a loss is not finite; the step is then not taken.
+        """
+        if len(self._replay) < self.cfg.warmup_steps * self._env.num_envs:
+            return
+        with torch_threads(1):
+            for _ in range(self.cfg.updates_per_step):
+                self._update()
+
+    def after_step(self, step: Step) -> None:
+        """Append a step to the replay, and its observations to their statistics."""
+        info = step.info
+        self._replay.append(
+            {
+                "observation": step.obs,
+                "action": step.action,
+                "terms": torch.stack(tuple(info["raw_terms"].values()), -1),
+                "terminated": step.terminated,
+                "next_observation": info["final_obs"],
+            }
+        )
+        self.model.normalizer.update(step.obs.to(self.model.device))
+
+    def learn(self, rollout: Rollout) -> dict[str, float]:
+        """Return the means of what the iteration's updates logged."""
+        logged, self._logged = self._logged, []
+        names = {name for one in logged for name in one}
+        return {
+            name: float(torch.stack([one[name] for one in logged if name in one]).mean())
+            for name in sorted(names)
+        }
+
+    def finish(self) -> None:
+        """Delete the replay."""
+        self._replay.remove()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return networks, targets, temperature, optimisers, streams, and how far the replay is."""
+        return {
+            "model": {name: value.clone() for name, value in self.model.state_dict().items()},
+            "loss": {name: value.clone() for name, value in self._loss.state_dict().items()},
+            "optimizers": {name: o.state_dict() for name, o in self._optimizers.items()},
+            "streams": [g.get_state() for g in (self._actions, self._samples)],
+            "updates": self._updates,
+            "replay": self._replay.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from ``state_dict``.
+
+        Raises:
+            CheckpointError: if the replay's files are not those of the checkpoint.
+        """
+        self._replay.load_state_dict(state["replay"])
+        self.model.load_state_dict(state["model"])
+        self._loss.load_state_dict(state["loss"])
+        for name, optimizer in self._optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        for stream, stored in zip((self._actions, self._samples), state["streams"], strict=True):
+            stream.set_state(stored)
+        self._updates = int(state["updates"])
+
+    def _update(self) -> None:
+        batch = self._batch()
+        self._updates += 1
+        with self._precision():
+            critic_loss = self._loss.critic_loss(batch)
+        logged = {"loss_critic": critic_loss.detach()}
+        self._step("critics", critic_loss)
+        if self._updates % self.cfg.actor_interval == 0:
+            with self._precision():
+                policy, temperature, entropy = self._loss.policy_and_temperature_loss(batch)
+            logged |= {
+                "loss_policy": policy.detach(),
+                "entropy": entropy / self._env.action_dim,
+                "temperature": self._loss.log_alpha.detach().exp(),
+            }
+            self._step("policy", policy)
+            self._step("temperature", temperature)
+        self._targets.step()
+        self._logged.append(logged)
+
+    def _step(self, name: str, loss: Tensor) -> None:
+        if not math.isfinite(float(loss)):
+            raise RunError(
+                f"the loss of the {name} is {float(loss)}; the step was not taken, the last "
+                "checkpoint is good: try a lower algo.learning_rate"
+            )
+        optimizer = self._optimizers[name]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    def _batch(self) -> Any:
+        from pgdm.rl.sac_loss import TensorDict
+
+        frames = self._replay.sample().to(self.model.device)
+        normalize = self.model.normalizer
+        weights = torch.tensor(list(self._env.reward_weights().values()))
+        reward = self.cfg.reward_scale * (frames["terms"] @ weights.to(frames.device).float())
+        ended = frames["terminated"][:, None]
+        after = {
+            "observation": normalize(frames["next_observation"]),
+            "reward": reward[:, None],
+            "terminated": ended,
+            "done": ended,
+        }
+        batch = {
+            "observation": normalize(frames["observation"]),
+            "action": frames["action"],
+            "next": TensorDict(after, batch_size=frames.batch_size),
+        }
+        return TensorDict(batch, batch_size=frames.batch_size)
+
+    def _precision(self) -> torch.autocast:
+        return torch.autocast(
+            self.model.device.type, dtype=torch.bfloat16, enabled=self.cfg.bfloat16
+        )
+
+    def _adam(self, params: list[Tensor]) -> torch.optim.Adam:
+        first, second = self.cfg.adam_betas
+        return torch.optim.Adam(
+            params, lr=self.cfg.learning_rate, betas=(first, second), fused=True
+        )
+
+
+def columns(env: VecEnv) -> dict[str, Column]:
+    """Return what the replay keeps of each frame.
+
+    Reward terms are kept before weighting, so that a weight that changes over a training holds for
+    the past too.
+    """
+    from pgdm.rl.replay import Column
+
+    return {
+        "observation": Column(torch.float16, (env.obs_dim,)),
+        "action": Column(torch.float16, (env.action_dim,)),
+        "terms": Column(torch.float32, (len(env.reward_weights()),)),
+        "terminated": Column(torch.bool),
+        "next_observation": Column(torch.float16, (env.obs_dim,)),
+    }

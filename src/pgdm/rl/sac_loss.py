@@ -1,0 +1,102 @@
+"""TorchRL's soft actor-critic loss over pgdm's networks, and its randomness under control."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from pgdm.rl.networks import ActionValue, SquashedPolicy
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # torchrl's compiled part, unused here, is of another torch
+    from tensordict import TensorDict
+    from tensordict.nn import (
+        ProbabilisticTensorDictModule,
+        ProbabilisticTensorDictSequential,
+        TensorDictModule,
+    )
+    from torchrl.modules import TanhNormal
+    from torchrl.objectives import SACLoss, SoftUpdate
+
+__all__ = ["SoftActorCriticLoss", "SoftUpdate", "TensorDict"]
+
+
+class SoftActorCriticLoss(SACLoss):
+    """`SACLoss` whose two halves are asked for one at a time, drawing from a stream of its own.
+
+    Without vmap: as one batched product the two critics take twice the time on a CPU.
+
+    Args:
+        policy: the actor.
+        critics: the critics, of one shape.
+        gamma: discount per control step.
+        temperature: weight of the entropy at the start.
+        target_entropy: what the temperature steers the policy's entropy to, nat.
+        generator: stream of the actions that the losses sample.
+    """
+
+    log_alpha: torch.nn.Parameter
+
+    def __init__(
+        self,
+        policy: SquashedPolicy,
+        critics: list[ActionValue],
+        *,
+        gamma: float,
+        temperature: float,
+        target_entropy: float,
+        generator: torch.Generator,
+    ) -> None:
+        actor = ProbabilisticTensorDictSequential(
+            [
+                TensorDictModule(policy, ["observation"], ["loc", "scale"]),
+                ProbabilisticTensorDictModule(
+                    ["loc", "scale"],
+                    ["action"],
+                    distribution_class=TanhNormal,
+                    return_log_prob=True,
+                ),
+            ]
+        )
+        super().__init__(
+            actor,
+            [
+                TensorDictModule(critic, ["observation", "action"], ["state_action_value"])
+                for critic in critics
+            ],
+            num_qvalue_nets=len(critics),
+            loss_function="l2",
+            alpha_init=temperature,
+            target_entropy=target_entropy,
+            deactivate_vmap=True,
+        )
+        self.make_value_estimator(gamma=gamma)
+        self._generator = generator
+
+    def critic_loss(self, batch: TensorDict) -> Tensor:
+        """Return the squared error () of all critics, summed over them."""
+        with _drawing_from(self._generator):
+            return self.qvalue_v2_loss(batch)[0]
+
+    def policy_and_temperature_loss(self, batch: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the policy's loss (), the temperature's (), and the policy's entropy (), nat."""
+        with _drawing_from(self._generator):
+            loss, about = self.actor_loss(batch)
+        log_prob = about["log_prob"]
+        return loss, self.alpha_loss(log_prob).mean(), -log_prob.mean()
+
+
+@contextmanager
+def _drawing_from(generator: torch.Generator) -> Iterator[None]:
+    """Let what draws from torch's global stream draw from this one inside."""
+    outside = torch.get_rng_state()
+    torch.set_rng_state(generator.get_state())
+    try:
+        yield
+    finally:
+        generator.set_state(torch.get_rng_state())
+        torch.set_rng_state(outside)
