@@ -100,6 +100,7 @@ class PointEnv:
             "final_obs": self._obs(),
             "terms": {"near": reward},
             "raw_terms": {"near": near},
+            "discount": None,
             "episodes": None,
         }
         if done.any():
@@ -180,7 +181,8 @@ class ScriptedEnv:
         done = self._terminated[t] | self._truncated[t]
         obs = torch.where(done[:, None], -final, final)  # after a restart: the negative
         terms = {"script": self._reward[t]}
-        info = {"final_obs": final, "terms": terms, "raw_terms": terms, "episodes": None}
+        info = {"final_obs": final, "terms": terms, "raw_terms": terms}
+        info |= {"discount": None, "episodes": None}
         return obs, self._reward[t], self._terminated[t], self._truncated[t], info
 
     def _obs(self) -> Tensor:
@@ -220,5 +222,6 @@ class FreeEnv(ScriptedEnv):
         obs = self._obs()
         reward = self._rewards[self.t % 16]
         terms = {"script": reward}
-        info = {"final_obs": obs, "terms": terms, "raw_terms": terms, "episodes": None}
+        info = {"final_obs": obs, "terms": terms, "raw_terms": terms}
+        info |= {"discount": None, "episodes": None}
         return obs, reward, self._no, self._no, info

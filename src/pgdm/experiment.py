@@ -61,7 +61,9 @@ class RunResult:
 def env_builder(cfg: ExperimentCfg, library: Library) -> EnvBuilder:
     """Compile the task of an experiment."""
     start = cfg.pregrasp, cfg.ablation
-    env = EnvCfg(cfg.task, cfg.hand, cfg.sim, *start, cfg.obs, cfg.action, cfg.reference)
+    env = EnvCfg(
+        cfg.task, cfg.hand, cfg.sim, *start, cfg.obs, cfg.action, cfg.reference, cfg.shaping
+    )
     return EnvBuilder(library, env, recipe(cfg.method))
 
 

@@ -11,6 +11,7 @@ from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.library import expert_file, figures
 from pgdm.mdp.actions import KINDS, ActionCfg
 from pgdm.mdp.observations import LAYOUTS, ObsCfg
+from pgdm.mdp.shaping import ShapingCfg
 from pgdm.methods import MethodCfg, config_class, recipe
 from pgdm.motion.reference import FRAMES, ReferenceCfg
 from pgdm.pregrasp.ablate import AblationCfg
@@ -41,6 +42,8 @@ class ExperimentCfg:
     """What the policy sees."""
     action: ActionCfg
     """What an action means."""
+    shaping: ShapingCfg
+    """What trainings add to reward and ends; evaluations never see it."""
     reference: ReferenceCfg
     """How the stored motion becomes targets."""
     algo: Annotated[AlgoCfg, ChosenBy("learner", algo_class)]
@@ -84,6 +87,7 @@ class ExperimentCfg:
         _check_choices(flat)
         _check_ranges(flat)
         self.method.validate()
+        self.shaping.validate()
         self.algo.check(self.num_envs)
         self.ablation.check(self.pregrasp.source)
         self._check_hand()

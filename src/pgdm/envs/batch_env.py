@@ -130,7 +130,8 @@ class BatchEnv:
             terminated (N,) bool, the object was lost or the motion ended; truncated (N,) bool,
             the simulation diverged; info with ``final_obs`` (N, D), ``qpos`` (N, nq),
             ``object_error_m`` (N,), ``success`` (N,) bool, ``terms`` {name: (N,)} weighted
-            rewards, ``raw_terms`` before weighting, ``measures`` {name: (N,)}, NaN where they do
+            rewards, ``raw_terms`` before weighting, ``discount`` (N,) that the future counts less
+            in a shaped training or None, ``measures`` {name: (N,)}, NaN where they do
             not apply, ``ends`` {name: (N,) bool} and ``episodes``, the `Finished` episodes, or
             None.
         """
@@ -150,11 +151,13 @@ class BatchEnv:
         raw = torch.stack([term.value(context) for term in self.mdp.recipe.rewards])  # (K, N)
         measures = {m.name: m.value(context) for m in self.mdp.recipe.measures}
         ends = {end.name: end.reached(context) for end in self.mdp.recipe.ends}
+        discount = None if (rule := self.mdp.recipe.discount) is None else rule(context)
         final = self.mdp.observe(state, self._t)
         if some_diverged:
             raw = raw.masked_fill(diverged, 0.0)
             measures = {k: v.masked_fill(diverged, torch.nan) for k, v in measures.items()}
             ends = {name: reached & ~diverged for name, reached in ends.items()}
+            discount = None if discount is None else discount.masked_fill(diverged, 1.0)
             final[diverged] = self._obs[diverged]
             rows = diverged.nonzero()[:, 0]
             self._history.dump(rows.tolist(), self._t[rows].tolist())
@@ -174,6 +177,7 @@ class BatchEnv:
             "success": context.object_error <= self.mdp.recipe.metrics.success_threshold_m,
             "terms": dict(zip(self._names, terms.unbind(), strict=True)),
             "raw_terms": dict(zip(self._names, raw.unbind(), strict=True)),
+            "discount": None if discount is None else discount.float(),
             "measures": measures,
             "ends": ends,
             "episodes": self._finished(finished, diverged, ends) if len(finished) else None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,16 @@ from pgdm.library import Expert, Library
 from pgdm.mdp.actions import ActionCfg, action_map
 from pgdm.mdp.observations import ObsCfg, layout
 from pgdm.mdp.recipe import Recipe
+from pgdm.mdp.shaping import ShapingCfg, shaped
 from pgdm.motion.reference import FRAMES, ExpertReference, ObjectReference, ReferenceCfg
 from pgdm.pregrasp.ablate import AblationCfg, ablate
 from pgdm.pregrasp.sources import PregraspCfg, start_state
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.randomize import Randomizer
 from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
+
+TRAIN = "train"
+"""Stream of the simulations that a policy is trained in."""
 
 _FAR_M = 0.01
 """Clipped by more than this, an expert's hand is not where the person's was."""
@@ -39,6 +43,8 @@ class EnvCfg:
     obs: ObsCfg
     action: ActionCfg
     reference: ReferenceCfg
+    shaping: ShapingCfg | None = None
+    """What trainings add; None: nothing."""
 
 
 class EnvBuilder:
@@ -133,17 +139,21 @@ class EnvBuilder:
         num_envs: int,
         num_threads: int = 0,
         seed: int = 0,
-        stream: str = "train",
+        stream: str = TRAIN,
         auto_reset: bool = True,
         dump_dir: Path | None = None,
     ) -> BatchEnv:
         """Return N simulations of the task; see `BatchEnv` for the arguments.
 
-        ``stream`` names what the simulations are for: each has random numbers of its own.
+        ``stream`` names what the simulations are for: each has random numbers of its own, and
+        those for ``train`` have the shaping.
         """
+        mdp, shaping = self.mdp, self._cfg.shaping
+        if shaping is not None and stream == TRAIN:
+            mdp = replace(mdp, recipe=shaped(mdp.recipe, shaping))
         sim = SimBatch(self.scene, num_envs, num_threads, self.motion.substeps)
         randomize = Randomizer(seed, stream, num_envs) if self.scene.task.randomize else None
-        return BatchEnv(sim, self.mdp, randomize, auto_reset, dump_dir)
+        return BatchEnv(sim, mdp, randomize, auto_reset, dump_dir)
 
 
 def _reference(cfg: ReferenceCfg, stored: ObjectReference, scene: Scene) -> ObjectReference:

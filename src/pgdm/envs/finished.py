@@ -30,12 +30,16 @@ class Finished:
     def metrics(self) -> dict[str, Tensor]:
         """Return each metric's values, (k,) float64; see `pgdm.mdp.metrics.episode_metrics`.
 
-        Beside those: ``return``, ``diverged``, ``end/<name>``, the mean of each measure under its
-        name, NaN where it never applied, and of each reward term the sum over the episode,
+        Beside those: ``return``, the sum of the task's own rewards, and ``shaping``, of those that
+        a training adds, if it does; ``diverged``, ``end/<name>``, the mean of each measure under
+        its name, NaN where it never applied, and of each reward term the sum over the episode,
         ``term/<name>`` weighted and ``raw/<name>`` before.
         """
         metrics = episode_metrics(self.episodes, self.reference, self.recipe.metrics)
-        metrics["return"] = self.sums[0].sum(0)
+        added = torch.tensor([term.shaping for term in self.recipe.rewards])
+        metrics["return"] = self.sums[0][~added].sum(0)
+        if added.any():
+            metrics["shaping"] = self.sums[0][added].sum(0)
         names = ["diverged", *(f"end/{end.name}" for end in self.recipe.ends)]
         metrics |= dict(zip(names, self.flags.double(), strict=True))
         for kind, sums in zip(("term", "raw"), self.sums, strict=True):

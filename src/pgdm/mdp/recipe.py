@@ -22,6 +22,8 @@ class RewardTerm:
     name: str
     weight: float
     value: Callable[[StepContext], Tensor]  # -> (n,) before weighting
+    shaping: bool = False
+    """Whether it is paid in trainings only, and no part of the task's own return."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,8 @@ class Recipe:
 
     measures: tuple[Measure, ...] = ()
     """Recorded for each episode as the mean over its steps, under their names."""
+    discount: Callable[[StepContext], Tensor] | None = None
+    """By how much the future counts less after a step, (n,) in [0, 1]; trainings only."""
     needs_expert: bool = False
     """Whether terms or measures compare with an expert's hand trajectory."""
 
@@ -84,6 +88,8 @@ class Recipe:
         values = {f"reward '{term.name}'": term.value(context) for term in self.rewards}
         values |= {f"end '{end.name}'": end.reached(context) for end in self.ends}
         values |= {f"measure '{m.name}'": m.value(context) for m in self.measures}
+        if self.discount is not None:
+            values["discount"] = self.discount(context)
         for name, value in values.items():
             if value.shape != context.t.shape:
                 raise ConfigError(

@@ -97,6 +97,7 @@ def advantages(
     reward: Tensor,
     terminated: Tensor,
     truncated: Tensor,
+    discount: Tensor,
     *,
     gamma: float,
     gae_lambda: float,
@@ -110,6 +111,7 @@ def advantages(
         reward: (T, N).
         terminated: nothing came after, (T, N) bool.
         truncated: the episode was cut there, (T, N) bool.
+        discount: by how much what comes after the step counts less, besides gamma, (T, N).
         gamma: discount per step.
         gae_lambda: decay of the longer estimates.
     """
@@ -125,7 +127,7 @@ def advantages(
     # A value that is not finite would survive the multiplication with 0 that switches it off.
     following = next_values.masked_fill(terminated, 0.0)
     advantage, target = generalized_advantage_estimate(
-        gamma,
+        gamma * layout(discount),  # TorchRL says a number, and takes one for each step as well
         gae_lambda,
         layout(values),
         layout(following),

@@ -163,6 +163,7 @@ class PPOLearner:
                 rollout.reward,
                 rollout.terminated,
                 rollout.truncated,
+                rollout.discount,
                 gamma=cfg.gamma,
                 gae_lambda=cfg.gae_lambda,
             )

@@ -152,12 +152,13 @@ class SACLearner:
 
     def after_step(self, step: Step) -> None:
         """Append a step to the replay, and its observations to their statistics."""
-        info = step.info
+        info, discount = step.info, step.info["discount"]
         self._replay.append(
             {
                 "observation": step.obs,
                 "action": step.action,
                 "terms": torch.stack(tuple(info["raw_terms"].values()), -1),
+                "discount": torch.ones(len(step.obs)) if discount is None else discount,
                 "terminated": step.terminated,
                 "next_observation": info["final_obs"],
             }
@@ -245,6 +246,7 @@ class SACLearner:
         after = {
             "observation": normalize(frames["next_observation"]),
             "reward": reward[:, None],
+            "discount": frames["discount"][:, None],
             "terminated": ended,
             "done": ended,
         }
@@ -279,6 +281,7 @@ def columns(env: VecEnv) -> dict[str, Column]:
         "observation": Column(torch.float16, (env.obs_dim,)),
         "action": Column(torch.float16, (env.action_dim,)),
         "terms": Column(torch.float32, (len(env.reward_weights()),)),
+        "discount": Column(torch.float32),
         "terminated": Column(torch.bool),
         "next_observation": Column(torch.float16, (env.obs_dim,)),
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,8 +22,21 @@ with warnings.catch_warnings():
     )
     from torchrl.modules import TanhNormal
     from torchrl.objectives import SACLoss, SoftUpdate
+    from torchrl.objectives.value import TD0Estimator
 
 __all__ = ["SoftActorCriticLoss", "SoftUpdate", "TensorDict"]
+
+
+class DiscountedTD0(TD0Estimator):
+    """The one-step target r + gamma d V', d being the environment's own ``discount`` (M, 1)."""
+
+    def value_estimate(self, tensordict: Any, *args: Any, **kwargs: Any) -> Tensor:
+        """Return the target, (M, 1)."""
+        after = tensordict["next"]
+        value = after[self.tensor_keys.value] * after["discount"]
+        discounted = tensordict.copy()
+        discounted["next"] = after.copy().set(self.tensor_keys.value, value)
+        return super().value_estimate(discounted, *args, **kwargs)
 
 
 class SoftActorCriticLoss(SACLoss):
@@ -74,7 +88,8 @@ class SoftActorCriticLoss(SACLoss):
             target_entropy=target_entropy,
             deactivate_vmap=True,
         )
-        self.make_value_estimator(gamma=gamma)
+        estimator: Any = DiscountedTD0  # TorchRL takes a class as well as a name
+        self.make_value_estimator(estimator, gamma=gamma)
         self._generator = generator
 
     def critic_loss(self, batch: TensorDict) -> Tensor:

@@ -49,7 +49,8 @@ class VecEnv(Protocol):
             terminated (N,) bool; truncated (N,) bool; info with ``final_obs`` (N, D), the true
             last observations, ``episodes``, those that finished (`Finished`) in the order of
             their rows, or None, and {name: (N,)} of the reward terms, ``raw_terms`` before and
-            ``terms`` after weighting.
+            ``terms`` after weighting; ``discount`` (N,) in [0, 1], by which what comes after the
+            step counts less, or None for 1.
         """
         ...
 
