@@ -11,6 +11,7 @@ import numpy as np
 
 from pgdm.errors import SceneError
 from pgdm.library import Library
+from pgdm.library.check import compile_tracked
 
 # SPEC 5, R: the randomised contact geom outranks what it touches, so that its friction counts.
 RANDOMIZED_PRIORITY = 10
@@ -178,7 +179,7 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
         _place(spec, placement)
     randomized = _randomized_geom(spec, task) if task.randomize else None
     try:
-        model = spec.compile()
+        model = compile_tracked(spec, task.tracked_body)
     except ValueError as error:
         raise SceneError(f"the scene of task '{task.id}' does not compile: {error}") from error
     return Scene(
