@@ -6,11 +6,13 @@ import sys
 import pytest
 
 from pgdm.config.identity import (
+    ADDED_LATER,
     check_continues,
     default_run_dir,
     difference,
     identity,
     identity_hash,
+    with_added_keys,
 )
 from pgdm.config.store import compose
 from pgdm.errors import RunError
@@ -23,8 +25,8 @@ BESIDE = [
 CHANGES = [
     "seed=1", "num_envs=64", "task=duck-lift", "hand=dhand", "pregrasp=mined", "obs=paper",
     "action=residual", "algo=ppo_fast", "algo.clip=0.1", "method.reward.lift_weight=0",
-    "sim.solver_iterations=10", "eval.episodes=5", "task.timestep_s=0.002",
-    "pregrasp.fallback=null",
+    "sim.solver_iterations=10", "sim.object_mass=published", "eval.episodes=5",
+    "task.timestep_s=0.002", "pregrasp.fallback=null",
 ]  # fmt: skip
 
 
@@ -68,6 +70,17 @@ def test_identity_is_of_plain_values() -> None:
 def test_the_difference_has_both_values() -> None:
     changed = compose(["seed=3", "algo.clip=0.1"])
     assert difference(compose(), changed) == ["algo.clip: 0.2 -> 0.1", "seed: 0 -> 3"]
+
+
+def test_a_key_that_came_later_changes_no_identity_at_the_value_of_before() -> None:
+    assert not identity(compose()).keys() & ADDED_LATER.keys()
+    changed = compose(["sim.object_mass=published"])
+    assert difference(compose(), changed) == ["sim.object_mass: volume -> published"]
+    assert difference(changed, compose()) == ["sim.object_mass: published -> volume"]
+    assert with_added_keys({"sim": {"a": 1}}) == {"sim": {"object_mass": "volume", "a": 1}}
+    stored = {"sim": {"object_mass": "published"}}
+    assert with_added_keys(stored) == stored
+    assert with_added_keys({"sim": None}) == {"sim": None}  # damaged: told by who builds it
 
 
 def test_a_run_may_grow() -> None:

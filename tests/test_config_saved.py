@@ -5,13 +5,17 @@ import tempfile
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pgdm.config.identity import identity
-from pgdm.config.saved import FILE, load_config, save_config
+from pgdm.config.identity import ADDED_LATER, changes_result, identity
+from pgdm.config.saved import FILE, check_run_dir, load_config, save_config
 from pgdm.config.store import compose
+from pgdm.config.strict import flatten
 from pgdm.errors import ConfigError, PgdmError, RunError
+
+STUDY = Path(__file__).resolve().parents[1] / "benchmark" / "results" / "study" / "runs"
 
 
 @pytest.mark.parametrize(
@@ -102,3 +106,26 @@ def test_a_truncated_file_is_refused(tmp_path: Path, cut: int) -> None:
 def test_a_run_made_on_a_gpu_can_be_looked_at_without_one(tmp_path: Path) -> None:
     save_config(dataclasses.replace(compose(), device="cuda"), tmp_path)
     assert load_config(tmp_path).device == "cuda"
+
+
+def test_a_run_older_than_a_key_is_read_and_is_the_same_experiment(tmp_path: Path) -> None:
+    cfg = compose([f"run_dir={tmp_path}"])
+    file = save_config(cfg, tmp_path)
+    plain = yaml.safe_load(file.read_text())
+    for key in ADDED_LATER:
+        group, _, name = key.rpartition(".")
+        del (plain[group] if group else plain)[name]
+    file.write_text(yaml.safe_dump(plain))
+    assert load_config(tmp_path) == cfg
+    check_run_dir(compose([f"run_dir={tmp_path}"]))
+    changed = compose([f"run_dir={tmp_path}", "sim.object_mass=published"])
+    with pytest.raises(RunError, match=r"sim\.object_mass: volume -> published"):
+        check_run_dir(changed)
+
+
+@pytest.mark.parametrize("setting", ["pgdm-residual", "distance_15cm-absolute"])
+def test_stored_runs_keep_their_identity(setting: str) -> None:
+    folder = STUDY / setting / "door-open"
+    flat = flatten(yaml.safe_load((folder / FILE).read_text()))
+    del flat["format"]
+    assert identity(load_config(folder)) == {k: v for k, v in flat.items() if changes_result(k)}

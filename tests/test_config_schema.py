@@ -38,6 +38,8 @@ from pgdm.methods import METHODS
         (["device=gpu"], "unknown device 'gpu'"),
         (["pregrasp.source=mimed"], "unknown pregrasp.source value 'mimed'; did you mean mined"),
         (["tracking.kind=wandb"], "unknown tracking.kind value 'wandb'"),
+        (["sim.object_mass=publish"], "unknown sim.object_mass value 'publish'; did you mean pub"),
+        (["sim.object_mass=none"], "unknown sim.object_mass value 'none'.*volume"),
         (["method.name=pgmd"], "unknown method.name value 'pgmd'; did you mean pgdm"),
         (["method.reward.tracking_scale=0"], "method.reward.tracking_scale is 0.0; it must be ab"),
         (["method=deepmimic", "method.imitation.space=joint"], "'joint'; did you mean joints"),

@@ -183,7 +183,7 @@ def test_an_edited_file_is_read_anew(tmp_path: Path) -> None:
     (tmp_path / "sim").mkdir()
     file = tmp_path / "sim" / "mine.yaml"
     for iterations, when in ((7, 1_000), (9, 2_000)):
-        file.write_text(f"solver_iterations: {iterations}\nnoslip_iterations: 1\n")
+        file.write_text(f"defaults: [default]\nsolver_iterations: {iterations}\n")
         os.utime(file, (when, when))
         cfg = compose(["sim=mine"], config_dir=tmp_path)
         assert cfg.sim.solver_iterations == iterations

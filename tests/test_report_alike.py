@@ -35,6 +35,22 @@ def test_starts_and_assets_that_differ_within_a_setting_are_told(tmp_path: Path)
     }
 
 
+def test_runs_of_another_scene_of_the_task_are_told(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    old, new = ({"scene_sha256": digit * 64} for digit in "ab")
+    make(root / "a", 0.7, "task=door-open", told=CHECKOUT | old)
+    make(root / "b", 0.7, "task=door-open", "seed=1", told=CHECKOUT | new)
+    make(root / "c", 0.7, "task=cup-pour1", told=CHECKOUT | new)
+    page = text_of(report(root))
+    assert page.count("Not made alike:") == 1
+    assert (
+        "the finished runs of pgdm have different checkout door-open scenes: aaaaaaaa (1 run), "
+        "bbbbbbbb (1 run). Their averages mix these."
+    ) in page
+    make(root / "d", 0.1, "task=cup-pour1", told=CHECKOUT | old, state="interrupted")
+    assert "../runs/d (checkout cup-pour1 scene aaaaaaaa, not bbbbbbbb)" in text_of(report(root))
+
+
 def test_runs_that_are_left_out_are_named(tmp_path: Path) -> None:
     root = tmp_path / "runs"
     make(root / "best", 0.7, "task=cup-pour1", told=CHECKOUT)

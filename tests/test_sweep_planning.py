@@ -107,6 +107,18 @@ def test_a_plan_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert moved.jobs[1].cfg.run_dir == str(tmp_path / "outside")
 
 
+def test_a_plan_older_than_a_key_is_read_and_its_jobs_are_the_same() -> None:
+    plan = planned(("seed=0",), ("seed=1",))
+    record(plan)
+    file = plan.folder / FILE
+    whole = json.loads(file.read_text())
+    for job in whole["jobs"]:
+        del job["config"]["sim"]["object_mass"]
+    file.write_text(json.dumps(whole))
+    assert read_plan(plan.folder) == plan
+    assert [job.key for job in check_fits(plan)] == [job.key for job in plan.jobs]
+
+
 def test_more_jobs_are_added_to_those_that_are_there() -> None:
     record(planned(("seed=0",), ("seed=1",)))
     record(planned(("seed=1",), ("seed=2",)))

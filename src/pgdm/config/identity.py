@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,10 +39,42 @@ _BESIDE = (
 )
 
 
+# Keys that came after the first runs, and the values that those runs amount to.
+ADDED_LATER: dict[str, Any] = {
+    "algo.learner": "ppo",
+    "keep_replay": False,
+    "shaping.name": "none",
+    "shaping.kernel_weight": 0.0,
+    "shaping.kernel_scale": 10.0,
+    "shaping.soft_end_m": None,
+    "sim.object_mass": "volume",
+}
+
+
+def with_added_keys(plain: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a stored configuration with the keys that it is too old to have."""
+    result = dict(plain)
+    for key, value in ADDED_LATER.items():
+        group, _, name = key.rpartition(".")
+        if not group:
+            result.setdefault(name, value)
+        elif isinstance(inner := result.get(group, {}), Mapping):
+            result[group] = {name: value} | dict(inner)
+    return result
+
+
 def identity(cfg: ExperimentCfg) -> dict[str, Any]:
-    """Return the keys (dotted) and values that change the result of an experiment."""
+    """Return the keys (dotted) and values that change the result of an experiment.
+
+    A key of ``ADDED_LATER`` is left out at its value there, so that an experiment keeps the hash,
+    folder and sweep job that it had before there was the key.
+    """
     flat = flatten(dataclasses.asdict(cfg))
-    return {k: v for k, v in flat.items() if changes_result(k)}
+    return {
+        k: v
+        for k, v in flat.items()
+        if changes_result(k) and not (k in ADDED_LATER and v == ADDED_LATER[k])
+    }
 
 
 def changes_result(key: str) -> bool:
@@ -65,7 +98,7 @@ def default_run_dir(cfg: ExperimentCfg) -> str:
 
 def difference(old: ExperimentCfg, new: ExperimentCfg) -> list[str]:
     """Return what changed of the identity, one ``key: old -> new`` an entry."""
-    before, after = identity(old), identity(new)
+    before, after = ADDED_LATER | identity(old), ADDED_LATER | identity(new)
     return [
         f"{key}: {before.get(key)} -> {after.get(key)}"
         for key in sorted(before.keys() | after.keys())

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from pgdm.config.identity import check_continues
+from pgdm.config.identity import check_continues, with_added_keys
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.strict import build
 from pgdm.errors import ConfigError, RunError
@@ -48,7 +48,8 @@ def save_config(cfg: ExperimentCfg, run_dir: str | os.PathLike[str]) -> Path:
 def load_config(run_dir: str | os.PathLike[str]) -> ExperimentCfg:
     """Read the configuration of a run folder.
 
-    Its ``run_dir`` is the folder it was read from, wherever that has been moved to.
+    Its ``run_dir`` is the folder it was read from, wherever that has been moved to. Keys that came
+    after the run was made have the values that it was made with.
 
     Raises:
         RunError: if the folder holds no run.
@@ -67,7 +68,7 @@ def load_config(run_dir: str | os.PathLike[str]) -> ExperimentCfg:
             f"{file} has format {version}, this pgdm reads up to {FORMAT}; install a newer pgdm"
         )
     try:
-        cfg = build(ExperimentCfg, plain | {"run_dir": str(run_dir)})
+        cfg = build(ExperimentCfg, with_added_keys(plain) | {"run_dir": str(run_dir)})
         cfg.validate()
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}; {cure}") from error

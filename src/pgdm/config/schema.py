@@ -20,7 +20,7 @@ from pgdm.rl.algos import algo_class
 from pgdm.rl.checkpoint import CheckpointCfg
 from pgdm.rl.evaluate import EvalCfg
 from pgdm.rl.learner import AlgoCfg
-from pgdm.sim.scene import HandCfg, SimCfg, TaskCfg
+from pgdm.sim.scene import OBJECT_MASSES, HandCfg, SimCfg, TaskCfg
 from pgdm.tracking import TRACKERS, TrackingCfg
 
 
@@ -156,6 +156,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "action.kind": tuple(KINDS),
     "reference.frame": FRAMES,
     "hand.gravity_compensation": ("all", "base"),
+    "sim.object_mass": OBJECT_MASSES,
     "tracking.kind": tuple(TRACKERS),
     "resume": ("auto", "never", "must"),
 }

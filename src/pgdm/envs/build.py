@@ -13,6 +13,7 @@ import torch
 from pgdm.envs.batch_env import BatchEnv, Mdp
 from pgdm.errors import UnknownNameError
 from pgdm.library import Expert, Library
+from pgdm.library.published_masses import RATIOS
 from pgdm.mdp.actions import ActionCfg, action_map
 from pgdm.mdp.observations import ObsCfg, layout
 from pgdm.mdp.recipe import Recipe
@@ -27,6 +28,8 @@ from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
 TRAIN = "train"
 """Stream of the simulations that a policy is trained in."""
 
+_AWAY_M = 0.1
+"""Further than this from its first target, an object does not start where its motion begins."""
 _FAR_M = 0.01
 """Clipped by more than this, an expert's hand is not where the person's was."""
 
@@ -87,6 +90,14 @@ class EnvBuilder:
                 f"{self.scene.asset_source}; starting from '{used}' ('pgdm pregrasp reach {task}' "
                 "plans one)"
             )
+        if (note := self._away_from_target()) is not None:
+            notes.append(note)
+        unknown = ", ".join(name for name in self.scene.task.objects if name not in RATIOS)
+        if unknown and self._cfg.sim.object_mass == "published":
+            notes.append(
+                f"sim.object_mass=published: the published mass of {unknown} is not known; "
+                "the mass by volume stays"
+            )
         if self.ablated is not None:
             ablation = self._cfg.ablation
             if told := self.ablated.compromises(ablation.distance_m):
@@ -102,6 +113,19 @@ class EnvBuilder:
                 "methods follow it clipped to them, that far from the object"
             )
         return notes
+
+    def _away_from_target(self) -> str | None:
+        """Return a sentence if the object starts far from its first target, with both points."""
+        sim = SimBatch(self.scene, 1, 1, self.motion.substeps)
+        sim.reset(np.array([0]), self.mdp.start.qpos, self.mdp.start.qvel)
+        start, target = sim.read().object_pos[0], self.mdp.reference.pos[0]
+        away = float(torch.linalg.vector_norm(start - target))
+        if away <= _AWAY_M:
+            return None
+        return (
+            f"the object of {self.scene.task.id} starts {100 * away:.0f} cm from its first target: "
+            f"its centre of mass is at ({_point(start)}) m, the target at ({_point(target)}) m"
+        )
 
     def _expert_beyond_m(self) -> float:
         """Return by how much the base of the expert's hand leaves its limits at most."""
@@ -132,7 +156,17 @@ class EnvBuilder:
         """Yield what of a run's recorded facts is not so here."""
         for key, now in self.facts().items():
             if recorded.get(key) != now:
-                yield f"{key} '{recorded.get(key)}', and the library now has '{now}'"
+                told = f"{key} '{recorded.get(key)}', and the library now has '{now}'"
+                yield told + (self._recentred() if key == "scene_sha256" else "")
+
+    def _recentred(self) -> str:
+        """Return what is to be said of an older run's scene, if its tracked body is massless."""
+        if self.scene.model.body_mass[self.scene.index.object_body] > 0:
+            return ""
+        return (
+            f" (the tracked body {self.scene.task.tracked_body} is massless: its centre of mass is "
+            "now its origin, and lay elsewhere in runs of earlier versions)"
+        )
 
     def make(
         self,
@@ -154,6 +188,10 @@ class EnvBuilder:
         sim = SimBatch(self.scene, num_envs, num_threads, self.motion.substeps)
         randomize = Randomizer(seed, stream, num_envs) if self.scene.task.randomize else None
         return BatchEnv(sim, mdp, randomize, auto_reset, dump_dir)
+
+
+def _point(pos: torch.Tensor) -> str:
+    return ", ".join(f"{x:.3f}" for x in pos.tolist())
 
 
 def _reference(cfg: ReferenceCfg, stored: ObjectReference, scene: Scene) -> ObjectReference:

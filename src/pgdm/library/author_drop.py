@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pgdm.errors import LibraryError
+from pgdm.library.check import compile_tracked
 from pgdm.library.lowest import lowest
 
 HEIGHT_M = 0.005
@@ -66,7 +67,7 @@ def drop(
         mujoco.MjSpec.from_file(str(object_xml)), prefix="it/", frame=spec.worldbody.add_frame()
     )
     spec.body("it/object").pos = (0.0, 0.0, 0.0)
-    model = spec.compile()
+    model = compile_tracked(spec, "it/object")
     data = mujoco.MjData(model)
     body = model.body("it/object").id
     start = Rotation.identity() if turn is None else turn

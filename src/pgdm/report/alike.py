@@ -35,7 +35,7 @@ def mixed(results: Results) -> list[Mixed]:
     found = []
     for setting in results.settings:
         made = [_made(run) for run in results.runs if run.setting == setting and run.finished]
-        for fact in _FACTS:
+        for fact in dict.fromkeys(fact for facts in made for fact in facts):
             counts = Counter(facts[fact] for facts in made if fact in facts)
             if len(counts) > 1:
                 found.append(Mixed(setting, fact, dict(counts.most_common())))
@@ -50,14 +50,19 @@ def left_out(results: Results) -> list[Double]:
         own, other = _made(run), _made(counted[run.setting, run.task, run.seed])
         differences = [
             f"{fact} {own[fact]}, not {other[fact]}"
-            for fact in _FACTS
-            if fact in own and fact in other and own[fact] != other[fact]
+            for fact in own
+            if fact in other and own[fact] != other[fact]
         ]
         found.append(Double(run, differences))
     return sorted(found, key=lambda double: not double.differences)
 
 
 def _made(run: Run) -> dict[str, str]:
-    """Return what a run tells of the facts."""
+    """Return what a run tells of the facts.
+
+    A scene is compared with those of the same task and source only: others differ anyway.
+    """
     told = {fact: run.result.get(key) for fact, key in _FACTS.items()}
+    if (scene := run.result.get("scene_sha256")) is not None:
+        told[f"{told['asset source']} {run.task} scene"] = str(scene)[:8]
     return {fact: str(value) for fact, value in told.items() if value is not None}

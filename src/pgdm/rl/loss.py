@@ -9,7 +9,7 @@ hold this one equal to it and to stable-baselines3's.
 from __future__ import annotations
 
 import warnings
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -115,6 +115,8 @@ def advantages(
         gamma: discount per step.
         gae_lambda: decay of the longer estimates.
     """
+    # TorchRL asks for a number, and takes one for each step as well.
+    discounts: Any = gamma * discount.t().unsqueeze(-1)
     with warnings.catch_warnings():
         # Imported here, and quietly, because it costs 2 s, and warns that its compiled part (which
         # nothing here uses) was built for another torch.
@@ -127,7 +129,7 @@ def advantages(
     # A value that is not finite would survive the multiplication with 0 that switches it off.
     following = next_values.masked_fill(terminated, 0.0)
     advantage, target = generalized_advantage_estimate(
-        gamma * layout(discount),  # TorchRL says a number, and takes one for each step as well
+        discounts,
         gae_lambda,
         layout(values),
         layout(following),

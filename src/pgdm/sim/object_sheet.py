@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from pgdm.errors import SceneError
+from pgdm.library.check import compile_tracked
 from pgdm.sim.render import Renderer, write_image
 
 PANEL = 400, 320  # pixels, width and height
@@ -61,7 +62,7 @@ def _stage(object_xml: Path) -> tuple[mujoco.MjModel, int]:
         spec = mujoco.MjSpec.from_string(_STAGE)
         child = mujoco.MjSpec.from_file(str(object_xml))
         spec.attach(child, prefix="it/", frame=spec.worldbody.add_frame())
-        model = spec.compile()
+        model = compile_tracked(spec, "it/object")
     except ValueError as error:
         raise SceneError(f"{object_xml} does not compile: {error}") from error
     return model, model.body("it/object").id

@@ -11,6 +11,8 @@ import numpy as np
 
 from pgdm.errors import SceneError
 from pgdm.library import Library
+from pgdm.library.check import compile_tracked
+from pgdm.library.published_masses import RATIOS
 
 # SPEC 5, R: the randomised contact geom outranks what it touches, so that its friction counts.
 RANDOMIZED_PRIORITY = 10
@@ -102,6 +104,12 @@ class SimCfg:
     """Newton iterations at most per physics step."""
     noslip_iterations: int
     """Iterations of the noslip solver per physics step."""
+    object_mass: str
+    """``volume``: mass and inertia of objects as MuJoCo 4.0 takes them from their volume;
+    ``published``: scaled to the masses that MuJoCo had when the benchmark was published."""
+
+
+OBJECT_MASSES = ("volume", "published")
 
 
 _FREE_JOINTS = 6  # three slides and three hinges, as the benchmark has them
@@ -168,22 +176,41 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
     spec.option.timestep = task.timestep_s
     spec.option.iterations = sim.solver_iterations
     spec.option.noslip_iterations = sim.noslip_iterations
-    files = [library.hand_xml(hand.name, source)]
-    files += [library.object_xml(name, source) for name in task.objects]
-    for file in files:
-        child = _load(file)
-        frame = spec.worldbody.add_frame()
-        spec.attach(child, frame=frame, prefix=f"{child.modelname}/")
+    parts = [_load(library.hand_xml(hand.name, source))]
+    for name in task.objects:
+        parts.append(_load(library.object_xml(name, source)))
+        if sim.object_mass == "published":
+            scale_mass(parts[-1], RATIOS.get(name, 1.0))
+    for part in parts:
+        spec.attach(part, frame=spec.worldbody.add_frame(), prefix=f"{part.modelname}/")
     for placement in task.placements:
         _place(spec, placement)
     randomized = _randomized_geom(spec, task) if task.randomize else None
     try:
-        model = spec.compile()
+        model = compile_tracked(spec, task.tracked_body)
     except ValueError as error:
         raise SceneError(f"the scene of task '{task.id}' does not compile: {error}") from error
     return Scene(
         model, _index(model, task, hand, randomized), task, hand, library.origins(task.motion)
     )
+
+
+def scale_mass(spec: mujoco.MjSpec, ratio: float) -> None:
+    """Scale mass and inertia of all bodies of a model that is yet to be compiled, in place.
+
+    Not in the compiled model: there ``mj_setConst`` leaves ``stat.meaninertia`` behind, on which
+    the solver's tolerance depends.
+    """
+    for geom in spec.geoms:
+        if np.isnan(geom.mass):
+            geom.density *= ratio
+        else:
+            geom.mass *= ratio
+    for body in spec.bodies:
+        if body.explicitinertial:
+            body.mass *= ratio
+            body.inertia = ratio * body.inertia
+            body.fullinertia = ratio * body.fullinertia
 
 
 def _load(file: Path) -> mujoco.MjSpec:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pgdm.config.identity import difference, identity
+from pgdm.config.identity import difference, identity, with_added_keys
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.strict import build
 from pgdm.errors import ConfigError, SweepError
@@ -208,6 +208,6 @@ def read_plan(folder: Path) -> Plan:
 
 
 def _job(entry: Mapping[str, Any], folder: Path) -> Job:
-    config = dict(entry["config"])
+    config = with_added_keys(entry["config"])
     cfg = build(ExperimentCfg, config | {"run_dir": str(folder / config["run_dir"])})
     return Job(entry["key"], entry["name"], tuple(entry["overrides"]), cfg)
