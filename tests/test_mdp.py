@@ -136,7 +136,7 @@ def test_unknown_layout_and_kind_name_the_valid_ones() -> None:
     with pytest.raises(UnknownNameError, match="released"):
         layout(ObsCfg("relesed"), tiny_index(), ref)
     with pytest.raises(UnknownNameError, match="residual"):
-        action_map(ActionCfg("residul", 3, 0.25), tiny_index(), ref, torch.zeros(8))
+        action_map(ActionCfg("residul", 3, 0.25, False), tiny_index(), ref, torch.zeros(8))
 
 
 def tiny_index() -> SceneIndex:
@@ -159,7 +159,9 @@ def tiny_index() -> SceneIndex:
 
 def test_absolute_action_is_affine_and_clipped() -> None:
     ref = reference([[0.0, 0, 0]] * 3)
-    amap = absolute(ActionCfg("absolute", 3, 0.25), tiny_index(), ref, torch.zeros(8).double())
+    amap = absolute(
+        ActionCfg("absolute", 3, 0.25, False), tiny_index(), ref, torch.zeros(8).double()
+    )
     ctrl = amap.act(torch.tensor([[0.5, 0, 0, 0, 0, 0, 0.5, 9.0]]), torch.tensor([0]))[0]
     torch.testing.assert_close(ctrl, double([0.5, 0, 0, 0, 0, 0, 0.75, 2.0]))
 
@@ -167,7 +169,7 @@ def test_absolute_action_is_affine_and_clipped() -> None:
 def test_warm_start_adds_a_fifth_to_the_second_joint_and_the_fingers() -> None:
     ref = reference([[0.0, 0, 0]] * 3)
     start = double([0.5, 0, 0, 1.0, 0, 0, 0.5, 1.9])
-    amap = absolute(ActionCfg("absolute", 3, 0.25), tiny_index(), ref, start)
+    amap = absolute(ActionCfg("absolute", 3, 0.25, False), tiny_index(), ref, start)
     torch.testing.assert_close(amap.warm_start, double([0.5, 0.2, 0, 0.5, 0, 0, 0.2, 1.0]))
 
 
@@ -197,9 +199,20 @@ def test_wrist_carries_the_hand_rigidly() -> None:
     assert (rotations.angle(seen_quat, seen_quat[:1].expand_as(seen_quat)) < 1e-7).all()
 
 
+def test_a_path_out_of_range_can_be_corrected_only_if_it_is_brought_into_it() -> None:
+    # Mount x runs to 1.5 where the control range ends at 1: the correction reaches 0.25 from 1.5
+    # or from 1.
+    ref = reference([[0.0, 0, 0], [0.0, 1.5, 0.0]])
+    action, t = torch.tensor([[-1.0, 0, 0, 0, 0, 0, 0, 0]]), torch.tensor([1])
+    start = torch.zeros(8).double()
+    for within, expected in ((False, 1.0), (True, 0.75)):
+        amap = residual(ActionCfg("residual", 3, 0.25, within), tiny_index(), ref, start)
+        assert amap.act(action, t)[0, 0].item() == pytest.approx(expected)
+
+
 def test_residual_leads_by_three_steps_and_corrects_a_quarter() -> None:
     ref = reference([[0.0, 0.01 * k, 0.0] for k in range(10)])
-    cfg = ActionCfg("residual", 3, 0.25)
+    cfg = ActionCfg("residual", 3, 0.25, False)
     amap = residual(cfg, tiny_index(), ref, torch.zeros(8).double())
     action = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0, 0], [0.0] * 8])
     ctrl = amap.act(action, torch.tensor([2, 8]))

@@ -26,8 +26,18 @@ def column(*values: float) -> Tensor:
     return torch.tensor(values)[:, None]
 
 
-def gae(values: Tensor, following: Tensor, reward: Tensor, ends: Tensor, cuts: Tensor) -> Tensor:
-    advantage, target = advantages(values, following, reward, ends, cuts, gamma=0.5, gae_lambda=0.5)
+def gae(
+    values: Tensor,
+    following: Tensor,
+    reward: Tensor,
+    ends: Tensor,
+    cuts: Tensor,
+    discount: Tensor | None = None,
+) -> Tensor:
+    discount = torch.ones(reward.shape) if discount is None else discount
+    advantage, target = advantages(
+        values, following, reward, ends, cuts, discount, gamma=0.5, gae_lambda=0.5
+    )
     torch.testing.assert_close(target, advantage + values)
     return advantage[:, 0]
 
@@ -38,6 +48,14 @@ def test_advantages_without_an_end() -> None:
     never = column(NO, NO, NO)
     got = gae(column(1.0, 2, 3), column(2.0, 3, 4), column(1.0, 2, 3), never, never)
     torch.testing.assert_close(got, torch.tensor([1.5, 2.0, 2.0]))
+
+
+def test_a_discount_of_the_environment_shrinks_the_bootstrap_and_the_sum() -> None:
+    # delta = r + 0.5 * d * next - value, d = 1, 0.5, 0: 1; 2 + 0.75 - 2 = 0.75; 3 - 3 = 0
+    # A = delta + 0.25 * d * A_next: 1 + 0.25 * 0.75 = 1.1875; 0.75 + 0.125 * 0 = 0.75; 0
+    never, discount = column(NO, NO, NO), column(1.0, 0.5, 0.0)
+    got = gae(column(1.0, 2, 3), column(2.0, 3, 4), column(1.0, 2, 3), never, never, discount)
+    torch.testing.assert_close(got, torch.tensor([1.1875, 0.75, 0.0]))
 
 
 def test_a_termination_stops_the_bootstrap_and_the_sum() -> None:
@@ -60,12 +78,15 @@ def test_simulations_do_not_mix() -> None:
     values, following, reward = (torch.randn(7, 3, generator=generator) for _ in range(3))
     ends = torch.rand(7, 3, generator=generator) < 0.3
     cuts = (torch.rand(7, 3, generator=generator) < 0.3) & ~ends
-    together, _ = advantages(values, following, reward, ends, cuts, gamma=0.9, gae_lambda=0.8)
+    discount = torch.rand(reward.shape)
+    together, _ = advantages(
+        values, following, reward, ends, cuts, discount, gamma=0.9, gae_lambda=0.8
+    )
     for i in range(3):
         one = slice(i, i + 1)
         alone, _ = advantages(
             values[:, one], following[:, one], reward[:, one], ends[:, one], cuts[:, one],
-            gamma=0.9, gae_lambda=0.8,
+            discount[:, one], gamma=0.9, gae_lambda=0.8,
         )  # fmt: skip
         torch.testing.assert_close(together[:, one], alone)
 

@@ -111,6 +111,7 @@ def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
     kept = "it is kept" if cfg.keep_replay else "removed when the run has finished"
     return [
         *builder.notes,
+        *([told] if (told := cfg.shaping.described()) else []),
         *([f"the replay takes {disk / 1e9:.2f} GB of disk; {kept}"] if disk else []),
         *(
             f"the weight of '{name}' only comes to {last:.3g} of {weight:g} in "

@@ -181,6 +181,7 @@ _AT_LEAST: dict[str, int] = {
     "algo.updates_per_step": 1,
     "algo.actor_interval": 1,
     "algo.warmup_steps": 1,
+    "algo.target_entropy_frames": 1,
     "sim.solver_iterations": 1,
     "sim.noslip_iterations": 0,
     "eval.episodes": 1,

@@ -31,6 +31,10 @@ class ActionCfg:
     """Residual: steps by which the wrist's target runs ahead, against the servo's lag."""
     residual_scale: float
     """Residual: largest correction as a share of half the actuator's range (0..1)."""
+    path_within_limits: bool
+    """Residual: whether the wrist's path is brought into the actuators' ranges before it is
+    corrected; otherwise no correction moves a joint whose path lies further outside than it
+    reaches."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,8 @@ def residual(
     path = wrist_path(index, reference, start)
     low, high = torch.from_numpy(index.ctrl_low), torch.from_numpy(index.ctrl_high)
     reach = cfg.residual_scale * 0.5 * (high - low)[:n]
+    if cfg.path_within_limits:
+        path = torch.clamp(path, low[:n], high[:n])
 
     def act(a: Tensor, t: Tensor) -> Tensor:
         target = base.act(a, t)

@@ -32,16 +32,24 @@ class ShapingCfg:
     soft_end_m: float | None
     """Distance at which the future is discounted by a further 1/e, m; None: not at all."""
 
+    def described(self) -> str:
+        """Return what it does in a sentence, or nothing."""
+        parts = []
+        if self.kernel_weight:
+            parts.append(f"{self.kernel_weight:g} exp(-{self.kernel_scale:g} e) is paid besides")
+        if self.soft_end_m is not None:
+            parts.append(f"the future counts for exp(-(e/{self.soft_end_m:g})^2) of itself")
+        what = f"in trainings only, with the object e metres off: {', '.join(parts)}"
+        return f"shaping={self.name}: {what}" if parts else ""
+
     def validate(self) -> None:
         """Check the numbers.
 
         Raises:
             ConfigError: at the first one that cannot be right.
         """
-        if self.kernel_weight < 0:
-            raise ConfigError(
-                f"shaping.kernel_weight is {self.kernel_weight}; it must be 0 or more"
-            )
+        if (weight := self.kernel_weight) < 0:
+            raise ConfigError(f"shaping.kernel_weight is {weight}; it must be at least 0")
         for key in ("kernel_scale", "soft_end_m"):
             value = getattr(self, key)
             if value is not None and value <= 0:

@@ -40,7 +40,11 @@ class SACCfg(AlgoCfg):
     actor_interval: int
     """The policy learns in every so manieth update."""
     target_entropy: float
-    """Entropy of the policy that the temperature steers to, nat per action entry."""
+    """Entropy of the policy that the temperature steers to at first, nat per action entry."""
+    target_entropy_end: float
+    """Where that has fallen to after ``target_entropy_frames``, linearly."""
+    target_entropy_frames: int
+    """Environment steps until then; not the run's length, so that runs may grow."""
     temperature_init: float
     """Weight of the entropy in the return at the start."""
     warmup_steps: int
@@ -111,7 +115,7 @@ class SACLearner:
             critics,
             gamma=cfg.gamma,
             temperature=cfg.temperature_init,
-            target_entropy=cfg.target_entropy * env.action_dim,
+            target_entropy=cfg.target_entropy * env.action_dim,  # at the start
             generator=self._actions,
         )
         self._targets = SoftUpdate(self._loss, tau=cfg.target_rate)
@@ -207,6 +211,7 @@ class SACLearner:
     def _update(self) -> None:
         batch = self._batch()
         self._updates += 1
+        self._loss.target_entropy.fill_(self._target_entropy())
         with self._precision():
             critic_loss = self._loss.critic_loss(batch)
         logged = {"loss_critic": critic_loss.detach()}
@@ -223,6 +228,11 @@ class SACLearner:
             self._step("temperature", temperature)
         self._targets.step()
         self._logged.append(logged)
+
+    def _target_entropy(self) -> float:
+        cfg, passed = self.cfg, len(self._replay) / self.cfg.target_entropy_frames
+        change = cfg.target_entropy_end - cfg.target_entropy
+        return self._env.action_dim * (cfg.target_entropy + min(1.0, passed) * change)
 
     def _step(self, name: str, loss: Tensor) -> None:
         if not math.isfinite(float(loss)):

@@ -1,0 +1,67 @@
+"""What a training adds to reward and ends, and that an evaluation has none of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pgdm.config.store import compose
+from pgdm.errors import ConfigError
+from pgdm.experiment import env_builder
+from pgdm.library import open_library
+from pgdm.mdp.shaping import SLOPE, ShapingCfg
+
+SETTINGS = ("task=hammer-use1", "shaping=soft_end", "shaping.soft_end_m=0.1")
+KERNEL = ("shaping.kernel_weight=5", "shaping.kernel_scale=10")
+STILL = ShapingCfg("none", 0.0, 10.0, None)
+
+
+@pytest.mark.usefixtures("library_home")
+def test_a_training_has_the_slope_and_the_soft_end_and_an_evaluation_has_neither() -> None:
+    builder = env_builder(compose([*SETTINGS, *KERNEL]), open_library())
+    train, evaluation = builder.make(2, 1), builder.make(2, 1, stream="eval")
+    own_sum = added_sum = torch.zeros(2).double()
+    for _ in range(200):
+        action = train.warm_start().repeat(2, 1)
+        _, reward, terminated, _, info = train.step(action)
+        _, own, _, _, plain = evaluation.step(action)
+        error = plain["object_error_m"]
+        torch.testing.assert_close(info["discount"], torch.exp(-((error / 0.1) ** 2)).float())
+        torch.testing.assert_close(info["terms"][SLOPE], 5 * torch.exp(-10 * error))
+        torch.testing.assert_close(reward, (own + info["terms"][SLOPE]).float())
+        assert plain["discount"] is None and SLOPE not in plain["terms"]
+        own_sum, added_sum = own_sum + own, added_sum + info["terms"][SLOPE]
+        if terminated.any():
+            break
+    trained, measured = info["episodes"].metrics(), plain["episodes"].metrics()
+    torch.testing.assert_close(trained["return"], measured["return"])  # the task's own
+    torch.testing.assert_close(trained["shaping"], added_sum)
+    assert "shaping" not in measured
+
+
+@pytest.mark.usefixtures("library_home")
+def test_without_shaping_a_training_is_as_an_evaluation() -> None:
+    builder = env_builder(compose(["task=hammer-use1"]), open_library())
+    assert builder.make(1, 1).mdp.recipe is builder.mdp.recipe
+
+
+def test_what_is_added_is_said() -> None:
+    assert STILL.described() == ""
+    told = replace(STILL, name="mine", kernel_weight=5.0, soft_end_m=0.15).described()
+    assert told.startswith("shaping=mine: in trainings only")
+    assert "5 exp(-10 e)" in told and "exp(-(e/0.15)^2)" in told
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"kernel_weight": -1.0}, "kernel_weight is -1.0; it must be at least 0"),
+        ({"kernel_scale": 0.0}, "kernel_scale is 0.0; it must be above 0"),
+        ({"soft_end_m": -0.1}, "soft_end_m is -0.1; it must be above 0"),
+    ],
+)
+def test_wrong_numbers_are_named(changed: dict[str, float], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        replace(STILL, **changed).validate()
