@@ -1,11 +1,13 @@
 """What pgdm learns in a million frames on six varied tasks; stores results and curves beside it.
 
-    python benchmark/learning.py                 train what is missing, then collect
-    python benchmark/learning.py --collect       collect only
+    python benchmark/learning.py                    train what is missing, then collect
+    python benchmark/learning.py --frames 300000    go so far only; a later call goes on from there
+    python benchmark/learning.py --settings fast --seeds 0
+    python benchmark/learning.py --collect          collect only, also of runs that still go on
 
-Two settings, the same for all tasks: the paper's PPO on the paper's actions, and `algo=ppo_fast
-action=residual`. Each run is an ordinary `pgdm-run`, so that stopping and starting again goes on
-where it was. Two runs train at a time, one thread each.
+Three settings, each the same for all tasks: `+experiment=fast`, the paper's PPO on the paper's
+actions, and `algo=ppo_fast action=residual`. Each run is an ordinary `pgdm-run`, so that stopping
+and starting again goes on where it was. Two runs train at a time, one thread each.
 """
 
 from __future__ import annotations
@@ -16,88 +18,134 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
-from short_runs import Job, curves, finished, train_all
+from short_runs import Job, curves, train_all
 
 from pgdm.config.saved import load_config
 from pgdm.config.suites import suite
+from pgdm.tracking.run_folder import read_json
+from pgdm.tracking.run_log import RunLog, metrics_of
 
 RESULTS = Path(__file__).parent / "results" / "learning"
 FRAMES = 1_000_000
+EARLY = 300_000
+"""Frames after which the table shows success a first time."""
 
 QUICK6 = suite("quick6")
 SETTINGS = {
-    "ppo_fast-residual": ("algo=ppo_fast", "action=residual"),
-    "ppo-absolute": ("algo=ppo", "action=absolute"),
+    "fast": ("+experiment=fast", "eval.interval_frames=50000"),
+    "ppo_fast-residual": ("algo=ppo_fast", "action=residual", "eval.interval_frames=100000"),
+    "ppo-absolute": ("algo=ppo", "action=absolute", "eval.interval_frames=100000"),
 }
-COMMON = (
-    f"total_frames={FRAMES}",
-    "eval.interval_frames=100000",
-    "seed=0",
-    "eval.video_every_eval=false",
-)
+SEEDS = {"fast": (0, 1, 2), "ppo_fast-residual": (0,), "ppo-absolute": (0,)}
+COMMON = ("eval.video_every_eval=false", "keep_replay=true")
 CURVES = ("success", "lifted", "return", "com_error")
+KINDS = ("eval_sampled", "eval_deterministic")
 
 
 def collect(run: Path, job: Job) -> dict[str, Any] | None:
-    """Return what a finished run reached and how, or None if it has not finished."""
-    result = finished(run)
-    if result is None:
+    """Return how far a run has come and what it reached there, or None if it has not begun."""
+    curve = curves(run, "eval", [f"{kind}/{name}" for kind in KINDS for name in CURVES])
+    frames = curve.pop("frames")
+    if not frames:
         return None
-    cfg = load_config(run)
-    kinds = ("eval_sampled", "eval_deterministic")
-    curve = curves(run, "eval", [f"{kind}/{name}" for kind in kinds for name in CURVES])
+    cfg, result = load_config(run), read_json(run / "result.json")
+    last = [line for line in RunLog(run / "metrics.jsonl").read() if line["kind"] == "eval"][-1]
     return {
         "task": job.task,
         "setting": job.setting,
+        "seed": job.seed,
         "overrides": list(job.overrides),
         "paper_success": cfg.task.paper_success,
         "paper_com_error": cfg.task.paper_com_error,
-        "curve_frames": curve.pop("frames"),
+        "curve_frames": frames,
+        "curve_minutes": curve.pop("minutes"),
         "curves": curve,
-        **result,
+        "frames": frames[-1],
+        "wall_time_s": round(float(last["time_s"]), 1),
+        "metrics": metrics_of(last),
+        **{
+            k: result[k]
+            for k in ("scene_sha256", "motion_sha256", "git", "versions")
+            if k in result
+        },
     }
+
+
+def at(one: dict[str, Any], name: str, frames: int) -> float | None:
+    """Return a metric of a run at its evaluation next after so many frames, or None."""
+    for when, value in zip(one["curve_frames"], one["curves"][name], strict=True):
+        if when >= frames:
+            return value
+    return None
 
 
 def table(found: list[dict[str, Any]]) -> str:
     """Return the results as a Markdown table, the paper's figures beside them."""
     head = (
-        "| task | setting | success, sampled | deterministic | COM error, released form [m] "
-        "| lifted, deterministic | frames | minutes | paper: success | paper: error [m] |\n"
-        "|---|---|--:|--:|--:|--:|--:|--:|--:|--:|\n"
+        f"| task | setting | seed | success at {EARLY:,} frames, sampled | deterministic "
+        "| frames | minutes | success, sampled | deterministic | lifted, sampled "
+        "| COM error, released form [m] | paper: success | paper: error [m] |\n"
+        "|---|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n"
     )
     rows = []
     for r in found:
         m = r["metrics"]
-        lifted = m.get("eval_deterministic/lifted")
+        early = [at(r, f"{kind}/success", EARLY) for kind in KINDS]
+        shown = [*early, *(m[f"{kind}/success"] for kind in KINDS), m.get("eval_sampled/lifted")]
+        cells = ["-" if value is None else f"{value:.1%}" for value in shown]
         rows.append(
-            f"| {r['task']} | {r['setting']} | {m['eval_sampled/success']:.1%} "
-            f"| {m['eval_deterministic/success']:.1%} "
-            f"| {m['eval_sampled/com_error_released']:.2e} "
-            f"| {'-' if lifted is None else f'{lifted:.0%}'} | {r['frames']:,} "
-            f"| {r['wall_time_s'] / 60:.0f} | {r['paper_success']:.1%} "
+            f"| {r['task']} | {r['setting']} | {r['seed']} | {' | '.join(cells[:2])} "
+            f"| {r['frames']:,} | {r['wall_time_s'] / 60:.0f} | {' | '.join(cells[2:])} "
+            f"| {m['eval_sampled/com_error_released']:.2e} | {r['paper_success']:.1%} "
             f"| {r['paper_com_error']:.2e} |\n"
         )
     return head + "".join(rows)
 
 
+def means(found: list[dict[str, Any]]) -> str:
+    """Return each setting's mean over tasks and seeds, of the runs that have come so far."""
+    lines = []
+    for setting in SETTINGS:
+        for frames in (EARLY, FRAMES):
+            values = [
+                value
+                for r in found
+                if r["setting"] == setting
+                and (value := at(r, "eval_sampled/success", frames)) is not None
+            ]
+            if values:
+                lines.append(
+                    f"- {setting}: sampled success {sum(values) / len(values):.1%} at {frames:,} "
+                    f"frames, mean of {len(values)} runs\n"
+                )
+    return "".join(lines)
+
+
 def plot(found: list[dict[str, Any]], path: Path) -> None:
-    """Draw success, lift and return over frames, a panel a task and a line a setting."""
-    names = ("eval_deterministic/success", "eval_deterministic/lifted", "eval_sampled/return")
-    figure, axes = plt.subplots(len(names), len(QUICK6), figsize=(18, 8), squeeze=False)
+    """Draw success and lift, over frames and over minutes, a panel a task and a line a run."""
+    rows = [
+        ("eval_sampled/success", "curve_frames"),
+        ("eval_sampled/success", "curve_minutes"),
+        ("eval_sampled/lifted", "curve_frames"),
+    ]
+    figure, axes = plt.subplots(len(rows), len(QUICK6), figsize=(18, 8), squeeze=False)
     for column, task in enumerate(QUICK6):
-        for row, name in enumerate(names):
-            axis = axes[row][column]
-            for r in (r for r in found if r["task"] == task):
-                color = f"C{list(SETTINGS).index(r['setting'])}"
-                axis.plot(r["curve_frames"], r["curves"][name], color, label=r["setting"])
+        for row, (name, along) in enumerate(rows):
+            axis, labels = axes[row][column], set()
+            for r in (r for r in found if r["task"] == task and along in r):
+                setting = r["setting"]
+                color = f"C{list(SETTINGS).index(setting)}"
+                label = None if setting in labels else setting
+                labels.add(setting)
+                axis.plot(r[along], r["curves"][name], color, label=label)
             axis.set_title(task if row == 0 else "")
-            axis.set_ylabel(name.split("/")[1] if column == 0 else "")
-            axis.set_xlim(0, FRAMES)
-            axis.set_ylim(0, None if "return" in name else 1.02)
-    for axis in axes[0]:
-        if axis.has_data():
-            axis.legend(fontsize=8)
-    figure.suptitle(f"{FRAMES:,} frames, one seed (the paper's figures are after 50,000,000)")
+            axis.set_ylabel(name.replace("eval_", "").replace("/", " ") if column == 0 else "")
+            axis.set_xlabel(along.removeprefix("curve_"))
+            axis.set_xlim(0, FRAMES if along == "curve_frames" else None)
+            axis.set_ylim(0, 1.02)
+    if axes[0][0].has_data():
+        axes[0][0].legend(fontsize=8)
+    figure.suptitle("sampled policy, one line a seed (the paper's figures are after 50,000,000)")
     figure.tight_layout()
     figure.savefig(path, dpi=80)
 
@@ -106,27 +154,41 @@ def main() -> None:
     """Train, collect, draw."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=Path, default=Path("runs/learning"))
+    parser.add_argument("--frames", type=int, default=FRAMES, help="how far to go")
+    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
+    parser.add_argument("--tasks", nargs="+", choices=QUICK6, default=QUICK6)
+    parser.add_argument("--seeds", nargs="+", type=int, help="of those each setting has")
     parser.add_argument("--collect", action="store_true", help="do not train")
     options = parser.parse_args()
-    jobs = [
-        Job(task, setting, (*COMMON, *overrides))
-        for setting, overrides in SETTINGS.items()
+    length = f"total_frames={options.frames}"
+    every = [
+        Job(task, setting, (*COMMON, *SETTINGS[setting]), seed)
+        for setting in SETTINGS
+        for seed in SEEDS[setting]
         for task in QUICK6
     ]
+    wanted = [
+        Job(job.task, job.setting, (*job.overrides, length), job.seed)
+        for job in every
+        if job.setting in options.settings
+        and job.task in options.tasks
+        and job.seed in (options.seeds or [job.seed])
+    ]
     if not options.collect:
-        train_all(options.runs, jobs)
+        train_all(options.runs, wanted)
     RESULTS.mkdir(parents=True, exist_ok=True)
-    for job in jobs:
+    for job in every:
         one = collect(options.runs / job.name, job)
         if one is not None:
             (RESULTS / f"{job.name}.json").write_text(json.dumps(one, indent=1) + "\n")
-    stored = [RESULTS / f"{job.name}.json" for job in jobs]
+    stored = [RESULTS / f"{job.name}.json" for job in every]
     found = [json.loads(file.read_text()) for file in stored if file.exists()]
     (RESULTS / "README.md").write_text(
-        f"# {len(found)} of {len(jobs)} runs\n\n`python benchmark/learning.py`\n\n{table(found)}"
+        f"# {len(found)} of {len(every)} runs\n\n`python benchmark/learning.py`\n\n"
+        f"{means(found)}\n{table(found)}"
     )
     plot(found, RESULTS / "curves.png")
-    print(table(found))
+    print(means(found), table(found), sep="\n")
 
 
 if __name__ == "__main__":

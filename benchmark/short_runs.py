@@ -24,17 +24,21 @@ class Job:
     task: str
     setting: str
     overrides: tuple[str, ...]
+    seed: int | None = None
+    """Where there are several."""
 
     @property
     def name(self) -> str:
         """Name of its folder and of its stored result."""
-        return f"{self.task}-{self.setting}"
+        name = f"{self.task}-{self.setting}"
+        return name if self.seed is None else f"{name}-s{self.seed}"
 
 
 def train(folder: Path, job: Job) -> int:
     """Train one run to its end, or go on with it; return the exit code."""
     command = [str(Path(sys.executable).with_name("pgdm-run")), f"task={job.task}", *job.overrides]
     command += [f"run_dir={folder / job.name}", "num_threads=1", "tracking=none"]
+    command += [] if job.seed is None else [f"seed={job.seed}"]
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / f"{job.name}.log", "a") as log:
         return subprocess.run(command, stdout=log, stderr=log).returncode
@@ -70,7 +74,10 @@ def curves(run: Path, kind: str, names: Sequence[str]) -> dict[str, list[float |
         names: metrics; None, which JSON has and NaN is not, where one was not recorded.
     """
     lines = [line for line in RunLog(run / "metrics.jsonl").read() if line["kind"] == kind]
-    found: dict[str, list[float | None]] = {"frames": [int(line["frames"]) for line in lines]}
+    found: dict[str, list[float | None]] = {
+        "frames": [int(line["frames"]) for line in lines],
+        "minutes": [round(float(line["time_s"]) / 60, 2) for line in lines],
+    }
     for name in names:
         values = [float(line.get(name, math.nan)) for line in lines]
         found[name] = [None if math.isnan(v) else round(v, 5) for v in values]

@@ -189,7 +189,7 @@ def train(builder: EnvBuilder, cfg: ExperimentCfg) -> tuple[float, float]:
     frames = cfg.num_envs * cfg.algo.steps_per_env
     env = builder.make(cfg.num_envs, threads)
     clock = Clock(builder, env)
-    trainer_cfg = TrainerCfg(cfg.algo, 0, frames * (ITERATIONS + 1), 0, 1e9, "cpu", threads)
+    trainer_cfg = TrainerCfg(cfg.algo, 0, frames * (ITERATIONS + 1), None, 0, 1e9, "cpu", threads)
     Trainer(env, trainer_cfg, Extras(callbacks=[clock])).run()
     done = frames * ITERATIONS
     return done / sum(clock.training_s[1:]), done / sum(clock.bare_s[1:])

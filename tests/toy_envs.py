@@ -45,6 +45,7 @@ def trainer_cfg(algo: PPOCfg = TOY, **changes: Any) -> TrainerCfg:
         algo=algo,
         seed=3,
         total_frames=4096,
+        time_limit_s=None,
         eval_interval_frames=0,
         checkpoint_interval_s=1e9,
         device="cpu",

@@ -256,6 +256,7 @@ class Run(Callback):
             algo=cfg.algo,
             seed=cfg.seed,
             total_frames=cfg.total_frames,
+            time_limit_s=None if cfg.time_limit_min is None else 60 * cfg.time_limit_min,
             eval_interval_frames=cfg.eval.interval_frames,
             checkpoint_interval_s=cfg.checkpoint.interval_s,
             device=cfg.device,

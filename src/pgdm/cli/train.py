@@ -66,6 +66,11 @@ def train(cfg: ExperimentCfg, patient: bool = False) -> int:
 
 
 def _show(cfg: ExperimentCfg, result: RunResult) -> None:
+    if result.frames < cfg.total_frames:
+        notify(
+            f"time_limit_min={cfg.time_limit_min:g} was reached at {result.frames:,} of "
+            f"{cfg.total_frames:,} frames; this is what was learned by then"
+        )
     console = Console()
     console.print(summary_table(cfg, result))
     # Not through rich: a path must stay whole on its line.

@@ -24,6 +24,7 @@ _BESIDE = (
     "budget",
     "num_threads",  # simulations do not depend on it
     "device",  # a run may move between machines
+    "time_limit_min",
     "total_frames",  # a longer run begins with the shorter one
     "tracking",
     "checkpoint",
@@ -49,6 +50,7 @@ ADDED_LATER: dict[str, Any] = {
     "shaping.kernel_scale": 10.0,
     "shaping.soft_end_m": None,
     "sim.object_mass": "volume",
+    "time_limit_min": None,
 }
 
 

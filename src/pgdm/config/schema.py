@@ -60,6 +60,8 @@ class ExperimentCfg:
     """The one integer from which every random stream comes, 0 or more."""
     total_frames: int
     """Length of the training, environment steps over all simulations."""
+    time_limit_min: float | None
+    """Minutes after which it ends with what it has, all attempts together; None: never."""
     num_envs: int
     """Simulations side by side."""
     num_threads: int
@@ -189,6 +191,7 @@ _AT_LEAST: dict[str, int] = {
     "checkpoint.keep_last": 1,
 }
 _ABOVE_ZERO = (
+    "time_limit_min",
     "task.timestep_s",
     "algo.learning_rate",
     "algo.adam_eps",

@@ -40,6 +40,8 @@ class TrainerCfg:
     """The run's seed."""
     total_frames: int
     """Environment steps to train for; the last iteration is completed."""
+    time_limit_s: float | None
+    """Time after which it ends with what it has, s, all attempts together; None: never."""
     eval_interval_frames: int
     """Environment steps between two evaluations; 0: only at the start and the end."""
     checkpoint_interval_s: float
@@ -115,6 +117,7 @@ class Trainer:
             env, self._learner, cfg.algo.steps_per_env, torch_stream(cfg.seed, "actions")
         )
         self._frames, self._iteration, self._elapsed_s = 0, 0, 0.0
+        self._total_frames = cfg.total_frames
         self._evaluated_at = -1
         self._last_evaluation: dict[str, float] = {}
         self._best_score: list[float] = []
@@ -130,7 +133,7 @@ class Trainer:
     @property
     def progress(self) -> Progress:
         """How far the training has come."""
-        return Progress(self._frames, self.cfg.total_frames, self._iteration, self._elapsed_s)
+        return Progress(self._frames, self._total_frames, self._iteration, self._elapsed_s)
 
     def run(self) -> Outcome:
         """Train until ``total_frames``, or until the stop flag.
@@ -149,12 +152,15 @@ class Trainer:
 
     def _loop(self) -> str:
         while True:
+            self._advance_clock()
+            if self.cfg.time_limit_s is not None and self._elapsed_s >= self.cfg.time_limit_s:
+                self._total_frames = min(self._total_frames, self._frames)
             if self._evaluation_due():
                 self._evaluate()
             if self.extras.stop():
                 self._save()
                 return "interrupted"
-            if self._frames >= self.cfg.total_frames:
+            if self._frames >= self._total_frames:
                 self._save()
                 if not self.extras.keep_replay:
                     self._learner.finish()
@@ -183,7 +189,7 @@ class Trainer:
     def _evaluation_due(self) -> bool:
         if self.extras.evaluation is None or self._evaluated_at == self._frames:
             return False
-        if self._evaluated_at < 0 or self._frames >= self.cfg.total_frames:
+        if self._evaluated_at < 0 or self._frames >= self._total_frames:
             return True
         interval = self.cfg.eval_interval_frames
         return interval > 0 and self._frames // interval > self._evaluated_at // interval
@@ -201,7 +207,7 @@ class Trainer:
             if self.extras.checkpoints is not None:
                 path = self.extras.checkpoints.save_best(self.state_dict())
                 self._tell(lambda callback: callback.on_checkpoint(self.progress, path))
-        if self._frames >= self.cfg.total_frames:
+        if self._frames >= self._total_frames:
             self._save()  # before anybody who listens can fail
         self._tell(lambda callback: callback.on_evaluation(self.progress, metrics))
 
