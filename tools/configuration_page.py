@@ -31,7 +31,7 @@ chooses a file of a group, `pgdm-run +experiment=NAME` applies a named set of ch
 exist, or a value of the wrong type, is an error before anything starts.
 
 Settings of your own go into a folder with the same layout: with `--config-dir my`, the file
-`my/experiment/fast.yaml` is `+experiment=fast`, and `my/task/mine.yaml` is `task=mine`.
+`my/experiment/ours.yaml` is `+experiment=ours`, and `my/task/mine.yaml` is `task=mine`.
 """
 
 
@@ -114,7 +114,10 @@ def _group(group: str, default: str | None) -> list[str]:
 
 def _command(experiment: Description) -> str:
     """Return what one would type without the named experiment."""
-    choices = [f"{g.removeprefix('override /')}={o}" for g, o in experiment.defaults.items()]
+    choices = [
+        f"{group.removeprefix('override /')}={option}" if option else f"+experiment={group}"
+        for group, option in experiment.defaults.items()
+    ]
     return " ".join(["pgdm-run", *choices, *(f"{k.name}={k.value}" for k in experiment.keys)])
 
 
@@ -126,7 +129,8 @@ def _changes(description: Description, main: Description, prefix: str) -> list[K
     changed = []
     for key in description.keys:
         # A file of package _global_ names its keys in full already.
-        name = key.name if key.name in known else f"{prefix}.{key.name}"
+        whole = key.name in known or key.name.startswith(f"{prefix}.")
+        name = key.name if whole else f"{prefix}.{key.name}"
         if name not in known:  # what this option has besides
             changed.append(Key(name, key.value, key.comment))
         elif key.value != known[name].value:
