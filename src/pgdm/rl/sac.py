@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from pgdm.errors import RunError
+from pgdm.errors import ConfigError, RunError
 from pgdm.rl.collector import Rollout, Step, torch_threads
 from pgdm.rl.learner import AlgoCfg
 from pgdm.rl.networks import ActionValue, SquashedCfg, SquashedPolicy
@@ -47,6 +47,14 @@ class SACCfg(AlgoCfg):
     """Control steps of all simulations before the first update."""
     bfloat16: bool
     """Whether matrix products are computed in bfloat16."""
+
+    def check(self, num_envs: int) -> None:
+        """Check Adam's decay rates; see `AlgoCfg.check`."""
+        if len(self.adam_betas) != 2 or not all(0 <= beta < 1 for beta in self.adam_betas):
+            raise ConfigError(
+                f"algo.adam_betas is {self.adam_betas}; it must be two numbers of at least 0 and "
+                "below 1, such as [0.9,0.99]"
+            )
 
     def capacity(self, num_envs: int, total_frames: int) -> int:
         """Return the frames of a training, whose last iteration is completed."""
@@ -172,10 +180,6 @@ class SACLearner:
             name: float(torch.stack([one[name] for one in logged if name in one]).mean())
             for name in sorted(names)
         }
-
-    def finish(self) -> None:
-        """Delete the replay."""
-        self._replay.remove()
 
     def state_dict(self) -> dict[str, Any]:
         """Return networks, targets, temperature, optimisers, streams, and how far the replay is."""
