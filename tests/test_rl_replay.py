@@ -1,4 +1,4 @@
-"""The replay: what is appended is sampled, outlives its process, and is checked before it is used."""
+"""The replay: what is appended is sampled, outlives its process, and is checked when reopened."""
 
 from __future__ import annotations
 

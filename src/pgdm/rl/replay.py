@@ -139,9 +139,9 @@ class Replay:
             for path in self._made:
                 path.unlink(missing_ok=True)
             raise CheckpointError(
-                f"the replay in {where} is gone (it lacks {self._made[0].name}): it is removed when "
-                "a run has finished, unless keep_replay=true; start anew in another run_dir, with "
-                "all the total_frames that you want"
+                f"the replay in {where} is gone (it lacks {self._made[0].name}): it is removed "
+                "when a run has finished, unless keep_replay=true; start anew in another run_dir, "
+                "with all the total_frames that you want"
             )
         for name in self.columns:
             found = zlib.crc32(self._data.get(name)[:frames].numpy().data)

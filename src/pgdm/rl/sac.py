@@ -228,9 +228,10 @@ class SACLearner:
         self._logged.append(logged)
 
     def _step(self, name: str, loss: Tensor) -> None:
-        if not math.isfinite(float(loss)):
+        value = float(loss.detach())
+        if not math.isfinite(value):
             raise RunError(
-                f"the loss of the {name} is {float(loss)}; the step was not taken, the last "
+                f"the loss of the {name} is {value}; the step was not taken, the last "
                 "checkpoint is good: try a lower algo.learning_rate"
             )
         optimizer = self._optimizers[name]
