@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor, nn
 
-from pgdm.rl.ppo import PPOCfg
 from pgdm.rl.loss import Samples
 from pgdm.rl.networks import ActorCritic
+from pgdm.rl.ppo import PPOCfg
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
