@@ -25,6 +25,14 @@ TINY = (
     "budget=smoke",
 )
 """A run of two iterations."""
+TINY_SAC = (
+    *(setting for setting in TINY if "minibatch" not in setting),
+    "algo=sac",
+    "algo.hidden=[16]",
+    "algo.batch_size=8",
+    "algo.warmup_steps=2",
+)
+"""The same with soft actor-critic."""
 
 
 @dataclass(frozen=True)

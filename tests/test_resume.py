@@ -22,7 +22,6 @@ SMALL = (
     "total_frames=10240",
     "num_envs=8",
     "algo.steps_per_env=32",
-    "algo.minibatch_size=64",
     "eval.interval_frames=2048",
     "eval.episodes=3",
     "eval.video=false",
@@ -31,13 +30,18 @@ SMALL = (
     "seed=7",
     "--offline",
 )
+LEARNING = {
+    "ppo": ["algo.minibatch_size=64"],
+    "ppo_fast": ["algo.minibatch_size=64"],
+    "sac": ["algo.batch_size=64", "algo.updates_per_step=1"],
+}
 TIMED = ("time_s", "train/steps_per_s")
 
 
 def command(folder: Path, threads: int, algo: str) -> list[str]:
     run = Path(sys.executable).with_name("pgdm-run")
-    rest = (f"algo={algo}", "algo.steps_per_env=32", f"num_threads={threads}", f"run_dir={folder}")
-    return [str(run), *SMALL, "num_envs=8", *rest]
+    rest = (f"algo={algo}", *LEARNING[algo], f"num_threads={threads}", f"run_dir={folder}")
+    return [str(run), *SMALL, *rest]
 
 
 def kill_at_random(arguments: list[str], folder: Path, rng: random.Random) -> None:
@@ -66,7 +70,7 @@ def metrics(folder: Path) -> list[dict]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("threads", "algo"), [(1, "ppo"), (2, "ppo_fast")])
+@pytest.mark.parametrize(("threads", "algo"), [(1, "ppo"), (2, "ppo_fast"), (2, "sac")])
 def test_three_kills_change_nothing(
     threads: int, algo: str, tmp_path: Path, library_home: Path
 ) -> None:

@@ -11,9 +11,10 @@ from torch import Tensor
 from pgdm.errors import CheckpointError
 from pgdm.rl.checkpoint import CheckpointFolder, write_checkpoint
 from pgdm.rl.evaluate import Evaluator, load_policy, run_episodes, summarise
+from pgdm.rl.learner import AlgoCfg
 from pgdm.rl.trainer import Extras, Trainer
 from pgdm.seeding import torch_stream
-from toy_envs import TOY, Ended, PointEnv, trainer_cfg
+from toy_envs import TOY, TOY_SAC, Ended, PointEnv, trainer_cfg
 
 
 class Still:
@@ -109,9 +110,19 @@ def test_a_stop_gives_up_between_steps() -> None:
     assert evaluator.evaluate(Still()) is not None
 
 
-@pytest.mark.parametrize("normalize", [False, True])
-def test_a_loaded_policy_acts_like_the_trained_one(tmp_path: Path, normalize: bool) -> None:
-    cfg = trainer_cfg(replace(TOY, normalize_observations=normalize), total_frames=512)
+@pytest.mark.parametrize(
+    ("algo", "normalizes"),
+    [
+        (TOY, False),
+        (replace(TOY, normalize_observations=True), True),
+        (replace(TOY_SAC, warmup_steps=50), True),
+    ],
+    ids=["ppo", "ppo, normalised", "sac"],
+)
+def test_a_loaded_policy_acts_like_the_trained_one(
+    tmp_path: Path, algo: AlgoCfg, normalizes: bool
+) -> None:
+    cfg = trainer_cfg(algo, total_frames=512)
     trainer = Trainer(PointEnv(scale=30.0), cfg, Extras(checkpoints=CheckpointFolder(tmp_path, 1)))
     trainer.run()
     [path] = CheckpointFolder(tmp_path, 1).all()
@@ -121,10 +132,11 @@ def test_a_loaded_policy_acts_like_the_trained_one(tmp_path: Path, normalize: bo
     assert torch.equal(policy.act(obs, deterministic=True), mean)
     sample = trainer.model.act(obs, torch_stream(1, "a"))
     assert torch.equal(policy.act(obs, torch_stream(1, "a")), sample)
-    assert (policy.normalizer is not None) == normalize
+    assert (policy.normalizer is not None) == normalizes
 
 
-def test_a_checkpoint_without_a_policy_is_refused(tmp_path: Path) -> None:
-    write_checkpoint(tmp_path / "a.ckpt", {"network": {"obs_dim": 3}})
+@pytest.mark.parametrize("network", [{"obs_dim": 3}, {"kind": "squashed"}, [], None])
+def test_a_checkpoint_without_a_policy_is_refused(tmp_path: Path, network: object) -> None:
+    write_checkpoint(tmp_path / "a.ckpt", {"network": network})
     with pytest.raises(CheckpointError, match="holds no policy"):
         load_policy(tmp_path / "a.ckpt")

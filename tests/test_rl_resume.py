@@ -18,15 +18,24 @@ import torch
 from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.rl.evaluate import Evaluator
+from pgdm.rl.learner import AlgoCfg
 from pgdm.rl.trainer import Extras, Trainer
-from toy_envs import TOY, PointEnv, trainer_cfg
+from toy_envs import TOY, TOY_SAC, PointEnv, trainer_cfg
 
 ITERATIONS = 12
 PAUSE_S = 0.06
 """Added to each iteration, so that three kills surely fall before the end."""
 # Wide enough that torch really splits the work over its threads.
-ALGO = replace(TOY, steps_per_env=64, minibatch_size=256, epochs=1, hidden=[256, 128])
-FRAMES = 8 * ALGO.steps_per_env
+PPO = replace(TOY, steps_per_env=64, minibatch_size=256, epochs=1, hidden=[256, 128])
+ALGOS: dict[str, AlgoCfg] = {
+    "ppo": PPO,
+    "ppo, normalised": replace(PPO, normalize_observations=True),
+    "sac": replace(TOY_SAC, steps_per_env=8, warmup_steps=4, batch_size=32),
+}
+
+
+SAC = ("pgdm.rl.replay", "pgdm.rl.sac_loss")
+"""What takes long to import and is imported late."""
 
 
 class Lines(Callback):
@@ -48,12 +57,13 @@ class Lines(Callback):
             file.write(json.dumps([kind, progress.frames, progress.iteration, kept]) + "\n")
 
 
-def train(folder: Path, threads: int, normalize: bool, pause_s: float) -> None:
+def train(folder: Path, threads: int, algo: str, pause_s: float) -> None:
     """Start or resume the training in a folder; runs in a process of its own."""
+    frames = per_iteration(algo)
     cfg = trainer_cfg(
-        replace(ALGO, normalize_observations=normalize),
-        total_frames=ITERATIONS * FRAMES,
-        eval_interval_frames=3 * FRAMES,
+        ALGOS[algo],
+        total_frames=ITERATIONS * frames,
+        eval_interval_frames=3 * frames,
         checkpoint_interval_s=0.0,
         num_threads=threads,
     )
@@ -62,6 +72,7 @@ def train(folder: Path, threads: int, normalize: bool, pause_s: float) -> None:
         evaluation=Evaluator(lambda n: PointEnv(n, seed=1), 4, 1, seed=3),
         checkpoints=checkpoints,
         callbacks=[Lines(folder / "lines", pause_s)],
+        replay_folder=folder / "replay",
     )
     trainer = Trainer(PointEnv(scale=30.0), cfg, extras)
     state = checkpoints.latest()
@@ -69,6 +80,10 @@ def train(folder: Path, threads: int, normalize: bool, pause_s: float) -> None:
         trainer.load_state_dict(state)
     trainer.run()
     (folder / "done").touch()
+
+
+def per_iteration(algo: str) -> int:
+    return 8 * ALGOS[algo].steps_per_env
 
 
 def lines(folder: Path) -> dict[tuple[str, int], Any]:
@@ -88,7 +103,7 @@ def lines(folder: Path) -> dict[tuple[str, int], Any]:
 def processes() -> Iterator[ForkServerContext]:
     """A server that has imported everything: starting a training costs milliseconds."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["test_rl_resume", "torchrl.objectives.value.functional"])
+    context.set_forkserver_preload(["test_rl_resume", "torchrl.objectives.value.functional", *SAC])
     yield context
 
 
@@ -98,35 +113,45 @@ def run(context: ForkServerContext, *args: Any) -> Any:
     return process
 
 
-@pytest.mark.parametrize("normalize", [False, True])
+def kill_at_random(process: Any, folder: Path) -> bool:
+    """Let a training come a random way beyond what it had, and kill it; tell if it was running."""
+
+    def logged() -> int:
+        file = folder / "lines"
+        return file.read_bytes().count(b"\n") if file.exists() else 0
+
+    enough = logged() + random.randint(0, 2)
+    while logged() < enough and process.is_alive():
+        time.sleep(0.002)
+    time.sleep(random.uniform(0.0, PAUSE_S))
+    alive = process.is_alive()
+    process.kill()
+    process.join()
+    return alive
+
+
+@pytest.mark.parametrize("algo", ALGOS)
 @pytest.mark.parametrize("threads", [1, 2])
 def test_killed_three_times_equals_never_stopped(
-    processes: ForkServerContext, tmp_path: Path, threads: int, normalize: bool
+    processes: ForkServerContext, tmp_path: Path, threads: int, algo: str
 ) -> None:
     straight, killed = tmp_path / "straight", tmp_path / "killed"
     for folder in (straight, killed):
         folder.mkdir()
-    process = run(processes, straight, threads, normalize, 0.0)
+    process = run(processes, straight, threads, algo, 0.0)
     process.join()
     assert process.exitcode == 0
 
-    hits = 0
     for _ in range(3):
-        process = run(processes, killed, threads, normalize, PAUSE_S)
-        deadline = time.monotonic() + random.uniform(0.05, ITERATIONS * PAUSE_S / 3)
-        while time.monotonic() < deadline and process.is_alive():
-            time.sleep(0.005)
-        hits += process.is_alive()
-        process.kill()
-        process.join()
-    assert hits == 3, "the training ended before it could be killed"
-    process = run(processes, killed, threads, normalize, 0.0)
+        process = run(processes, killed, threads, algo, PAUSE_S)
+        assert kill_at_random(process, killed), "the training ended before it could be killed"
+    process = run(processes, killed, threads, algo, 0.0)
     process.join()
     assert process.exitcode == 0
 
     last, other = (CheckpointFolder(folder, 2).latest() for folder in (straight, killed))
     assert last is not None and other is not None
-    assert last["frames"] == ITERATIONS * FRAMES
+    assert last["frames"] == ITERATIONS * per_iteration(algo)
     for state in (last, other):
         state.pop("elapsed_s")
     assert flat(other) == flat(last)

@@ -9,7 +9,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from pgdm.rl.learner import AlgoCfg
 from pgdm.rl.ppo import PPOCfg
+from pgdm.rl.sac import SACCfg
 from pgdm.rl.trainer import TrainerCfg
 from pgdm.seeding import torch_stream
 
@@ -40,7 +42,31 @@ TOY = replace(
 )
 
 
-def trainer_cfg(algo: PPOCfg = TOY, **changes: Any) -> TrainerCfg:
+TOY_SAC = SACCfg(
+    learner="sac",
+    name="sac",
+    gamma=0.95,
+    learning_rate=3e-3,
+    steps_per_env=32,
+    hidden=[32, 32],
+    log_std_init=-1.0,
+    warm_start=True,
+    observation_clip=10.0,
+    reward_scale=1.0,
+    adam_betas=[0.9, 0.99],
+    critics=2,
+    target_rate=0.02,
+    batch_size=64,
+    updates_per_step=1,
+    actor_interval=2,
+    target_entropy=-1.0,
+    temperature_init=0.05,
+    warmup_steps=16,
+    bfloat16=False,
+)
+
+
+def trainer_cfg(algo: AlgoCfg = TOY, **changes: Any) -> TrainerCfg:
     cfg = TrainerCfg(
         algo=algo,
         seed=3,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -269,7 +270,6 @@ class Run(Callback):
             callbacks=callbacks,
             stop=stop,
             replay_folder=self.dir / REPLAY,
-            keep_replay=cfg.keep_replay,
             metadata={**self.builder.facts(), "versions": versions()},
         )
         return Trainer(env, trainer_cfg, extras)
@@ -302,6 +302,9 @@ class Run(Callback):
 
     def _finish(self, outcome: Outcome) -> RunResult:
         self._write_result(outcome.status, outcome.progress, outcome.evaluation)
+        # Only now: until the run counts as finished, the same command goes on with its replay.
+        if outcome.status == "finished" and not self.cfg.keep_replay:
+            shutil.rmtree(self.dir / REPLAY, ignore_errors=True)
         return self._stored_result(read_json(self.dir / RESULT))
 
     def _write_result(

@@ -17,7 +17,7 @@ from pgdm.errors import CheckpointError, RunError
 from pgdm.experiment import assets, check_assets, env_builder, threads
 from pgdm.rl.checkpoint import CheckpointFolder, read_checkpoint
 from pgdm.rl.evaluate import Evaluator, load_policy
-from pgdm.rl.networks import ActorCritic
+from pgdm.rl.networks import ActorCritic, SquashedPolicy
 from pgdm.stop import StopRequest
 
 
@@ -76,7 +76,7 @@ def evaluate_policy(request: EvalRequest) -> int:
 def _measure(
     cfg: ExperimentCfg,
     builder: EnvBuilder,
-    policy: ActorCritic,
+    policy: ActorCritic | SquashedPolicy,
     request: EvalRequest,
     checkpoint: Path,
     stop: StopRequest,

@@ -46,6 +46,9 @@ COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, ValueEr
 PAPER_FRAMES = 50_000_000
 """Environment steps behind each of the paper's figures."""
 
+# Groups whose options have different keys.
+_DIFFERING = ("method", "algo")
+
 # Hydra keeps the current application in process-wide state, which two threads must not swap.
 _LOCK = threading.RLock()
 
@@ -219,8 +222,8 @@ def _explain_text(text: str, overrides: Sequence[str], config_dir: str | None) -
         if wrong[1] in names:
             section = wrong[1].rpartition(".")[0]
             return ConfigError(f"'{wrong[1]}' cannot be set, as {section} is null here")
-        if having := _methods_with(wrong[1], config_dir):
-            return ConfigError(f"'{wrong[1]}' is a setting of method={' or '.join(having)} only")
+        if having := _options_with(wrong[1], config_dir):
+            return ConfigError(f"'{wrong[1]}' is a setting of {' or '.join(having)} only")
         return UnknownNameError("key", wrong[1], names, "(pgdm-run --help lists them)")
     return ConfigError(text)
 
@@ -249,18 +252,23 @@ def _explain_task(name: str, tasks: Sequence[str], config_dir: str | None) -> Co
 
 
 def _known_names(overrides: Sequence[str], config_dir: str | None) -> list[str]:
-    """Return all keys of the experiment with the method that was chosen, dotted, and all groups."""
-    methods = [f"method={name}" for name in available("method", config_dir)]
-    chosen = [override for override in overrides if override in methods]
+    """Return all keys of the experiment with the options that were chosen, dotted, and all groups.
+
+    Only of groups whose options have different keys.
+    """
+    options = [f"{group}={name}" for group in _DIFFERING for name in available(group, config_dir)]
+    chosen = [override for override in overrides if override in options]
     return sorted({*_keys(chosen, config_dir), *groups(config_dir)})
 
 
-def _methods_with(key: str, config_dir: str | None) -> list[str]:
-    """Return the methods that have a key."""
-    if not key.startswith("method."):
+def _options_with(key: str, config_dir: str | None) -> list[str]:
+    """Return the options that have a key, of its group: the first with the group's name."""
+    group = key.partition(".")[0]
+    if group not in _DIFFERING:
         return []
-    names = available("method", config_dir)
-    return [name for name in names if key in _keys([f"method={name}"], config_dir)]
+    names = available(group, config_dir)
+    having = [name for name in names if key in _keys([f"{group}={name}"], config_dir)]
+    return [f"{group}={name}" if i == 0 else name for i, name in enumerate(having)]
 
 
 def _keys(overrides: Sequence[str], config_dir: str | None) -> list[str]:

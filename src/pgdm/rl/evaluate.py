@@ -14,7 +14,7 @@ from torch import Tensor
 from pgdm.errors import CheckpointError
 from pgdm.rl.checkpoint import read_checkpoint
 from pgdm.rl.collector import torch_threads
-from pgdm.rl.networks import ActorCritic, NetworkCfg
+from pgdm.rl.networks import ActorCritic, NetworkCfg, SquashedCfg, SquashedPolicy
 from pgdm.rl.vec_env import VecEnv
 from pgdm.seeding import torch_stream
 
@@ -150,7 +150,7 @@ def summarise(results: dict[str, Tensor], prefix: str = "") -> dict[str, float]:
     return summary
 
 
-def load_policy(path: Path) -> ActorCritic:
+def load_policy(path: Path) -> ActorCritic | SquashedPolicy:
     """Return the policy of a checkpoint, on the CPU, with its observation statistics.
 
     Raises:
@@ -158,7 +158,13 @@ def load_policy(path: Path) -> ActorCritic:
     """
     state = read_checkpoint(path)
     try:
-        model = ActorCritic(NetworkCfg(**state["network"]))
+        network = state["network"]
+        squashed = "kind" in network  # an ActorCritic's says none
+        model = (
+            SquashedPolicy(SquashedCfg(**network))
+            if squashed
+            else ActorCritic(NetworkCfg(**network))
+        )
         model.load_state_dict(state["learner"]["model"])
     except (KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{path} holds no policy of this version: {error}") from error

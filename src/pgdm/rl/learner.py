@@ -100,10 +100,6 @@ class Learner(Protocol):
         """
         ...
 
-    def finish(self) -> None:
-        """Clear away what only a training that goes on needs."""
-        ...
-
     def state_dict(self) -> dict[str, Any]:
         """Return all that the next iteration depends on."""
         ...

@@ -107,9 +107,6 @@ class PPOLearner:
     def after_step(self, step: Step) -> None:
         """Do nothing: the rollout has it."""
 
-    def finish(self) -> None:
-        """Do nothing: there are no files."""
-
     def learn(self, rollout: Rollout) -> dict[str, float]:
         """Take ``epochs`` passes over a rollout; return what is logged.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import shutil
@@ -66,10 +67,11 @@ class Replay:
         folder: Path | None = None,
     ) -> None:
         self.columns, self.capacity, self.folder = dict(columns), capacity, folder
+        self._made: list[Path] = []
         if folder is None:
             data = {n: torch.zeros(capacity, *c.shape, dtype=c.dtype) for n, c in columns.items()}
         else:
-            _reserve(folder, self.columns, capacity)
+            self._made = _reserve(folder, self.columns, capacity)
             data = {
                 name: MemoryMappedTensor.from_filename(
                     str(folder / f"{name}{_SUFFIX}"), c.dtype, torch.Size((capacity, *c.shape))
@@ -115,11 +117,6 @@ class Replay:
             with open(path, "rb") as file:
                 os.fsync(file.fileno())
 
-    def remove(self) -> None:
-        """Delete the files."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
-
     def state_dict(self) -> dict[str, Any]:
         """Return how many frames there are, and the checksum of each column."""
         self.sync()
@@ -129,7 +126,8 @@ class Replay:
         """Go on from the first ``frames`` frames of the files.
 
         Raises:
-            CheckpointError: if the files do not hold these frames.
+            CheckpointError: if the files do not hold these frames; those that were missing, and
+                only take room now, are deleted again.
         """
         frames, expected = int(state["frames"]), state["crc32"]
         where = self.folder or "the memory"
@@ -137,14 +135,21 @@ class Replay:
             raise CheckpointError(
                 f"the checkpoint has {frames:,} frames, {where} {self.capacity:,}"
             )
+        if frames and self._made:
+            for path in self._made:
+                path.unlink(missing_ok=True)
+            raise CheckpointError(
+                f"the replay in {where} is gone (it lacks {self._made[0].name}): it is removed "
+                "when a run has finished, unless keep_replay=true; start anew in another run_dir, "
+                "with all the total_frames that you want"
+            )
         for name in self.columns:
             found = zlib.crc32(self._data.get(name)[:frames].numpy().data)
             if found != expected.get(name):
                 raise CheckpointError(
                     f"the replay in {where} does not hold the {frames:,} frames that the "
                     f"checkpoint was made with (column '{name}' differs): it was cut, altered, "
-                    "removed at the end of the run, or is of another run; restore it, or start "
-                    "anew in another run_dir"
+                    "or is of another run; restore it, or start anew in another run_dir"
                 )
         self._crc = {name: int(expected[name]) for name in self.columns}
         self._set_length(frames)
@@ -158,18 +163,35 @@ class Replay:
         return [] if self.folder is None else sorted(self.folder.glob(f"*{_SUFFIX}"))
 
 
-def _reserve(folder: Path, columns: Mapping[str, Column], capacity: int) -> None:
-    """Make each column's file as large as it will be; what is in it stays."""
-    needed = capacity * sum(column.nbytes for column in columns.values())
+def _reserve(folder: Path, columns: Mapping[str, Column], capacity: int) -> list[Path]:
+    """Make each column's file as large as it will be; what is in it stays.
+
+    Returns:
+        The files that were missing.
+
+    Raises:
+        RunError: if there is no room; the files are then as they were.
+    """
+    sizes = {folder / f"{name}{_SUFFIX}": c.nbytes * capacity for name, c in columns.items()}
+    before = {path: path.stat().st_size for path in sizes if path.exists()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, column in columns.items():
-            with open(folder / f"{name}{_SUFFIX}", "ab") as file:
-                os.posix_fallocate(file.fileno(), 0, column.nbytes * capacity)
+        for path, size in sizes.items():
+            # Not in appending mode, and readable: where the file system cannot reserve (NFS), the
+            # C library reads and writes a byte of each block instead.
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                os.posix_fallocate(descriptor, 0, size)
+            finally:
+                os.close(descriptor)
     except OSError as error:
-        free = shutil.disk_usage(folder if folder.is_dir() else folder.parent).free
+        for path in sizes:
+            with contextlib.suppress(OSError):
+                os.truncate(path, before[path]) if path in before else path.unlink()
+        existing = next(p for p in (folder, *folder.parents) if p.is_dir())
         raise RunError(
-            f"cannot reserve {needed / 1e9:.1f} GB for the replay in {folder} "
-            f"({free / 1e9:.1f} GB free): {error.strerror or error}; make room, or choose fewer "
-            "total_frames or another run_dir"
+            f"cannot reserve {sum(sizes.values()) / 1e9:.1f} GB for the replay in {folder} "
+            f"({shutil.disk_usage(existing).free / 1e9:.1f} GB free): {error.strerror or error}; "
+            "make room, or choose fewer total_frames or another run_dir"
         ) from error
+    return [path for path in sizes if path not in before]

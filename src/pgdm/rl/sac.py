@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from pgdm.errors import RunError
+from pgdm.errors import ConfigError, RunError
 from pgdm.rl.collector import Rollout, Step, torch_threads
 from pgdm.rl.learner import AlgoCfg
 from pgdm.rl.networks import ActionValue, SquashedCfg, SquashedPolicy
@@ -51,6 +51,14 @@ class SACCfg(AlgoCfg):
     """Control steps of all simulations before the first update."""
     bfloat16: bool
     """Whether matrix products are computed in bfloat16."""
+
+    def check(self, num_envs: int) -> None:
+        """Check Adam's decay rates; see `AlgoCfg.check`."""
+        if len(self.adam_betas) != 2 or not all(0 <= beta < 1 for beta in self.adam_betas):
+            raise ConfigError(
+                f"algo.adam_betas is {self.adam_betas}; it must be two numbers of at least 0 and "
+                "below 1, such as [0.9,0.99]"
+            )
 
     def capacity(self, num_envs: int, total_frames: int) -> int:
         """Return the frames of a training, whose last iteration is completed."""
@@ -178,10 +186,6 @@ class SACLearner:
             for name in sorted(names)
         }
 
-    def finish(self) -> None:
-        """Delete the replay."""
-        self._replay.remove()
-
     def state_dict(self) -> dict[str, Any]:
         """Return networks, targets, temperature, optimisers, streams, and how far the replay is."""
         return {
@@ -235,9 +239,10 @@ class SACLearner:
         return self._env.action_dim * (cfg.target_entropy + min(1.0, passed) * change)
 
     def _step(self, name: str, loss: Tensor) -> None:
-        if not math.isfinite(float(loss)):
+        value = float(loss.detach())
+        if not math.isfinite(value):
             raise RunError(
-                f"the loss of the {name} is {float(loss)}; the step was not taken, the last "
+                f"the loss of the {name} is {value}; the step was not taken, the last "
                 "checkpoint is good: try a lower algo.learning_rate"
             )
         optimizer = self._optimizers[name]

@@ -68,8 +68,6 @@ class Extras:
     """Asked at safe points; True ends the training as ``interrupted``."""
     replay_folder: Path | None = None
     """Where an off-policy learner keeps what it saw; None: in memory, and not to be resumed."""
-    keep_replay: bool = False
-    """Whether that is kept when the training has finished."""
     metadata: dict[str, Any] = field(default_factory=dict)
     """Plain values stored in each checkpoint, such as what identifies the run."""
 
@@ -162,8 +160,6 @@ class Trainer:
                 return "interrupted"
             if self._frames >= self._total_frames:
                 self._save()
-                if not self.extras.keep_replay:
-                    self._learner.finish()
                 return "finished"
             if time.monotonic() - self._saved_at >= self.cfg.checkpoint_interval_s:
                 self._save()

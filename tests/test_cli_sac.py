@@ -1,0 +1,118 @@
+"""Soft actor-critic on the command line: its replay in the run folder, its policy afterwards."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from command_line import TINY, TINY_SAC, Outcome, command
+from pgdm.config.store import compose
+from pgdm.experiment import env_builder
+from pgdm.library import open_library
+from pgdm.tracking.run_folder import read_json
+
+FILES = {"observation", "action", "terms", "terminated", "next_observation"}
+
+
+def sac_run(*arguments: str) -> Outcome:
+    return command("pgdm-run", "--offline", *TINY_SAC, "run_dir=run", *arguments)
+
+
+def replay(run: Path) -> set[str]:
+    return {path.stem for path in (run / "replay").glob("*")}
+
+
+def test_a_dry_run_says_how_large_the_replay_is(library_home: Path, tmp_path: Path) -> None:
+    # 16 frames an iteration: the last one is completed.
+    outcome = sac_run("total_frames=1000001", "--dry-run")
+    assert outcome.code == 0, outcome.err
+    probe = env_builder(compose(["algo=sac"]), open_library()).make(1, 1)
+    terms = len(probe.reward_weights())
+    frame = 2 * (2 * probe.obs_dim + probe.action_dim) + 4 * terms + 1
+    said = " ".join((outcome.out + outcome.err).split())
+    assert f"the replay takes {1_000_016 * frame / 1e9:.2f} GB of disk" in said
+    assert "removed when the run has finished" in said
+    kept = sac_run("total_frames=1000001", "keep_replay=true", "--dry-run")
+    assert "it is kept" in " ".join((kept.out + kept.err).split())
+    ppo = command("pgdm-run", "--offline", *TINY, "--dry-run")
+    assert "replay" not in ppo.out + ppo.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_its_policy_and_the_end_of_its_replay(library_home: Path, tmp_path: Path) -> None:
+    run = sac_run("seed=3")
+    assert (run.code, run.errors) == (0, [])
+    assert "hammer-use1 (pgdm, absolute action, sac, seed 3)" in run.out
+    assert replay(tmp_path / "run") == set()
+    assert not (tmp_path / "run" / "replay").exists()
+
+    outcome = command("pgdm", "eval", "run", "--offline")
+    assert outcome.code == 0, outcome.err
+    rows = [
+        next(line for line in out.splitlines() if "return" in line).split("│")
+        for out in (run.out, outcome.out)
+    ]
+    assert [cell.strip() for cell in rows[1][2:4]] == [cell.strip() for cell in rows[0][3:5]]
+
+    again = sac_run("seed=3")
+    assert again.code == 0
+    assert "finished already" in again.err
+    longer = sac_run("seed=3", "total_frames=64")
+    assert longer.code == 1
+    [error] = longer.errors
+    assert re.search(r"replay in run.replay is gone .*removed when a run has finished", error)
+    assert "unless keep_replay=true" in error
+    assert "another run_dir" in error
+    assert replay(tmp_path / "run") == set()  # nothing that takes room is left behind
+    assert read_json(tmp_path / "run" / "result.json")["status"] == "finished"
+
+
+def test_a_replay_that_was_kept_lets_the_run_go_on(library_home: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    assert sac_run("keep_replay=true").code == 0
+    assert replay(folder) == FILES
+    assert sac_run().code == 0  # only shows the result
+    assert replay(folder) == FILES
+    longer = sac_run("total_frames=64")
+    assert (longer.code, longer.errors) == (0, [])
+    assert "continuing run at 32 frames" in " ".join(longer.err.split())
+    assert read_json(folder / "result.json")["frames"] == 64
+    assert not (folder / "replay").exists()
+
+
+def test_a_run_that_died_before_its_result_still_has_its_replay(
+    library_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        patched.setattr("pgdm.experiment.write_json", _no_room)
+        assert sac_run().code == 1
+    assert replay(folder) == FILES
+    again = sac_run()
+    assert (again.code, again.errors) == (0, [])
+    assert read_json(folder / "result.json")["status"] == "finished"
+    assert not (folder / "replay").exists()
+
+
+def _no_room(path: Path, content: object) -> None:
+    raise OSError(28, "No space left on device", str(path))
+
+
+def test_a_replay_that_was_lost_halfway_is_told(library_home: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    assert sac_run("keep_replay=true").code == 0
+    file = folder / "replay" / "action.bin"
+    original = file.read_bytes()
+    file.write_bytes(original[:100] + bytes([original[100] ^ 1]) + original[101:])
+    altered = sac_run("keep_replay=true", "total_frames=64")
+    assert len(altered.errors) == 1
+    assert "does not hold the 32 frames" in altered.errors[0]
+    assert "'action' differs" in altered.errors[0]
+    file.write_bytes(original)  # restored, as the message says
+    assert sac_run("keep_replay=true", "total_frames=64").code == 0
+    shutil.rmtree(folder / "replay")
+    gone = sac_run("keep_replay=true", "total_frames=96")
+    assert "is gone" in gone.errors[0]

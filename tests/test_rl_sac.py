@@ -1,0 +1,466 @@
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from pgdm.errors import ConfigError, RunError
+from pgdm.rl.callback import Callback, Progress
+from pgdm.rl.collector import Step
+from pgdm.rl.evaluate import Evaluator
+from pgdm.rl.networks import ActionValue, SquashedCfg, SquashedPolicy
+from pgdm.rl.sac import SACCfg, SACLearner, columns
+from pgdm.rl.sac_loss import SoftActorCriticLoss, SoftUpdate, TensorDict
+from pgdm.rl.trainer import Extras, Trainer
+from pgdm.seeding import torch_stream
+from toy_envs import TOY_SAC, PointEnv, trainer_cfg
+
+SHORT = replace(TOY_SAC, steps_per_env=8, warmup_steps=8, batch_size=32)
+"""An iteration of 64 frames; it learns from the second one on."""
+D, A, M = 5, 2, 64
+
+
+class Lines(Callback):
+    """Notes the metrics of each iteration, times aside."""
+
+    def __init__(self) -> None:
+        self.noted: list[dict[str, float]] = []
+
+    def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
+        self.noted.append({k: v for k, v in metrics.items() if "steps_per_s" not in k})
+
+
+def trained(
+    cfg: SACCfg = SHORT, frames: int = 512, seed: int = 3, threads: int = 1
+) -> tuple[Trainer, list[dict[str, float]]]:
+    lines = Lines()
+    settings = trainer_cfg(cfg, total_frames=frames, seed=seed, num_threads=threads)
+    trainer = Trainer(PointEnv(), settings, Extras(callbacks=[lines]))
+    trainer.run()
+    return trainer, lines.noted
+
+
+def flat(state: Any) -> Any:
+    """Return a state with its tensors as bytes."""
+    if isinstance(state, Tensor):
+        return state.numpy().tobytes()
+    if isinstance(state, dict):
+        return {k: flat(v) for k, v in state.items() if k != "elapsed_s"}
+    return [flat(v) for v in state] if isinstance(state, list | tuple) else state
+
+
+# The training as a whole.
+
+
+def test_sac_brings_the_point_to_the_origin() -> None:
+    evaluation = Evaluator(lambda n: PointEnv(n, seed=1), 16, 4, seed=3)
+    trainer = Trainer(
+        PointEnv(), trainer_cfg(TOY_SAC, total_frames=2048), Extras(evaluation=evaluation)
+    )
+    before = evaluation.evaluate(trainer.model)
+    after = trainer.run().evaluation
+    assert before is not None
+    for kind in ("eval_sampled", "eval_deterministic"):
+        # Both are negative: from 1 a step, and out of the square, to a fourth of that.
+        assert after[f"{kind}/return"] > before[f"{kind}/return"] / 3
+
+
+def test_the_same_seed_repeats_to_the_bit_whatever_the_global_stream() -> None:
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    first = trained()
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(2)
+    again, other = trained(), trained(seed=4)
+    assert first[1] == again[1]
+    assert flat(first[0].state_dict()) == flat(again[0].state_dict())
+    assert first[1] != other[1]
+
+
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_updates_beside_the_physics_change_no_bit(bfloat16: bool) -> None:
+    # Wide enough that torch really would split the products over its threads.
+    cfg = replace(SHORT, hidden=[256, 256], bfloat16=bfloat16)
+    alone, beside = (trained(cfg, frames=256, threads=threads) for threads in (1, 2))
+    assert alone[1] == beside[1]
+    assert flat(alone[0].state_dict()) == flat(beside[0].state_dict())
+
+
+def test_logged_numbers_and_when_they_begin() -> None:
+    _, noted = trained(frames=192)
+    learned = {"train/loss_critic", "train/loss_policy", "train/entropy", "train/temperature"}
+    assert not learned & noted[0].keys()  # it only acts
+    assert learned <= noted[1].keys()
+    assert noted[1]["train/temperature"] == pytest.approx(TOY_SAC.temperature_init, rel=0.1)
+    assert all(math.isfinite(value) for name, value in noted[2].items() if name in learned)
+
+
+@pytest.mark.parametrize(("actor_interval", "policies"), [(1, 12), (3, 4)])
+def test_so_many_updates_are_taken(actor_interval: int, policies: int) -> None:
+    env = PointEnv()
+    cfg = replace(SHORT, updates_per_step=3, actor_interval=actor_interval, warmup_steps=2)
+    learner = build(env, cfg)
+    counts: dict[str, int] = {}
+    for name, optimizer in learner._optimizers.items():
+        optimizer.register_step_post_hook(
+            lambda *_, name=name: counts.update({name: counts.get(name, 0) + 1})
+        )
+    step = one_step(env)
+    for _ in range(6):  # the first two are the warm-up
+        learner.during_step()
+        learner.after_step(step)
+    assert counts == {"critics": 12, "policy": policies, "temperature": policies}
+
+
+@pytest.mark.parametrize("betas", [[0.9], [0.9, 1.0], [-0.1, 0.9], [0.9, 0.99, 0.999]])
+def test_decay_rates_that_adam_cannot_take_are_refused(betas: list[float]) -> None:
+    with pytest.raises(ConfigError, match=r"^algo.adam_betas is \[.*such as \[0.9,0.99\]$"):
+        Trainer(PointEnv(), trainer_cfg(replace(TOY_SAC, adam_betas=betas)))
+
+
+def test_the_replay_is_as_large_as_it_says(tmp_path: Path) -> None:
+    env = PointEnv()
+    cfg = trainer_cfg(SHORT, total_frames=100)  # 2 iterations of 64
+    Trainer(env, cfg, Extras(replay_folder=tmp_path / "replay")).run()
+    on_disk = sum(path.stat().st_size for path in (tmp_path / "replay").iterdir())
+    # 5 + 5 observations and 2 actions of 2 bytes, 1 term of 4 bytes, 1 byte of the end.
+    assert on_disk == SHORT.disk_bytes(env, 100) == 128 * (2 * (5 + 5 + 2) + 4 + 1)
+
+
+# One update.
+
+
+def build(env: PointEnv, cfg: SACCfg) -> SACLearner:
+    return SACLearner(env, cfg, 3, 1024, None, "cpu", 1)
+
+
+def one_step(
+    env: PointEnv, near: float = -1.0, terminated: bool = False, obs: Tensor | None = None
+) -> Step:
+    """Return a step of all simulations with a given reward before weighting."""
+    n = env.num_envs
+    info = {
+        "final_obs": torch.zeros(n, D),
+        "raw_terms": {"near": torch.full((n,), near)},
+    }
+    ends = torch.full((n,), terminated)
+    return Step(torch.zeros(n, D) if obs is None else obs, torch.zeros(n, A), ends, info)
+
+
+def constant(learner: SACLearner, critics: list[float], targets: list[float]) -> None:
+    """Have each critic, and what it is steered to, answer one number."""
+    state = copy.deepcopy(learner.state_dict())
+    for prefix, values in (("qvalue", critics), ("target_qvalue", targets)):
+        last = f"{prefix}_network_params.module.net.6"
+        state["loss"][f"{last}.weight"].zero_()
+        state["loss"][f"{last}.bias"] = torch.tensor(values)[:, None]
+    learner.load_state_dict(state)
+
+
+@pytest.mark.parametrize(
+    ("terminated", "target"),
+    [
+        (True, 0.1 * -3.0),
+        # The lower of the critics' targets counts; the temperature is too small to.
+        (False, 0.1 * -3.0 + 0.5 * 4.0),
+    ],
+)
+def test_what_the_critics_are_steered_to(terminated: bool, target: float) -> None:
+    env = PointEnv()
+    cfg = replace(TOY_SAC, gamma=0.5, reward_scale=0.1, warmup_steps=1, temperature_init=1e-9)
+    learner = build(env, cfg)
+    learner.after_step(one_step(env, near=-3.0, terminated=terminated))
+    constant(learner, critics=[1.0, 2.0], targets=[5.0, 4.0])
+    learner.during_step()
+    logged = learner.learn(None)  # it looks at no rollout
+    assert logged["loss_critic"] == pytest.approx((1 - target) ** 2 + (2 - target) ** 2, rel=1e-5)
+
+
+def test_targets_follow_by_their_share() -> None:
+    env = PointEnv()
+    learner = build(env, replace(TOY_SAC, target_rate=0.25, warmup_steps=1))
+    learner.after_step(one_step(env))
+    before = flat_params(learner, "target_qvalue")
+    learner.during_step()
+    expected = 0.75 * before + 0.25 * flat_params(learner, "qvalue")
+    torch.testing.assert_close(flat_params(learner, "target_qvalue"), expected)
+    assert not torch.equal(before, expected)
+
+
+def flat_params(learner: SACLearner, prefix: str) -> Tensor:
+    loss = learner.state_dict()["loss"]
+    return torch.cat([v.flatten() for k, v in loss.items() if k.startswith(f"{prefix}_network")])
+
+
+def test_another_weight_holds_for_the_past_too() -> None:
+    env = PointEnv()
+    learner = build(env, replace(TOY_SAC, reward_scale=0.5))
+    for near in (-1.0, -2.0, -3.0):
+        learner.after_step(one_step(env, near))
+    state = learner.state_dict()
+    first = learner._batch()["next", "reward"]
+    env.set_weights({"near": 4.0})
+    learner.load_state_dict(state)  # the same rows
+    second = learner._batch()["next", "reward"]
+    assert set(first.flatten().tolist()) == {-0.5, -1.0, -1.5}
+    assert torch.equal(second, 4 * first)
+
+
+def test_observations_are_standardised_as_the_policys() -> None:
+    env = PointEnv()
+    learner = build(env, TOY_SAC)
+    obs = torch.arange(8.0)[:, None].expand(8, D).contiguous()
+    learner.after_step(one_step(env, obs=obs))
+    # 0 to 7: mean 3.5, variance (64 - 1) / 12 = 5.25.
+    batch = learner._batch()
+    expected = (torch.arange(8.0) - 3.5) / math.sqrt(5.25)
+    got = batch["observation"][:, 0]
+    assert ((got[:, None] - expected).abs().min(1).values < 1e-5).all()
+    torch.testing.assert_close(batch["next", "observation"], torch.full((M, D), float(expected[0])))
+
+
+def test_columns_have_room_for_all_terms() -> None:
+    env = PointEnv()
+    env.weights = {"near": 1.0, "far": 2.0, "there": 0.0}
+    shapes = {name: column.shape for name, column in columns(env).items()}
+    assert shapes == {
+        "observation": (D,),
+        "action": (A,),
+        "terms": (3,),
+        "terminated": (),
+        "next_observation": (D,),
+    }
+
+
+def test_a_loss_that_is_not_finite_is_named_and_changes_nothing() -> None:
+    env = PointEnv()
+    learner = build(env, replace(TOY_SAC, warmup_steps=1))
+    learner.after_step(one_step(env))
+    before = learner.state_dict()
+    env.set_weights({"near": math.inf})
+    with pytest.raises(RunError, match=r"^the loss of the critics is (inf|nan); .*is good") as told:
+        learner.during_step()
+    assert "\n" not in str(told.value)
+    after = learner.state_dict()
+    for part in ("model", "loss", "optimizers"):
+        assert flat(after[part]) == flat(before[part])
+
+
+# The loss.
+
+
+def networks(critics: int = 2) -> tuple[SquashedPolicy, list[ActionValue]]:
+    weights = torch_stream(0, "weights")
+    policy = SquashedPolicy(SquashedCfg("squashed", D, A, [16, 8], -1.0, 10.0), weights)
+    return policy, [ActionValue(D, A, [16, 8], weights) for _ in range(critics)]
+
+
+def sac_loss(
+    policy: SquashedPolicy, critics: list[ActionValue], temperature: float = 0.3
+) -> SoftActorCriticLoss:
+    loss = SoftActorCriticLoss(
+        policy,
+        critics,
+        gamma=0.9,
+        temperature=temperature,
+        target_entropy=-2.0,
+        generator=torch_stream(0, "policy"),
+    )
+    SoftUpdate(loss, tau=0.01)  # it warns if nothing updates its targets
+    return loss
+
+
+def batch_of(size: int) -> TensorDict:
+    stream = torch_stream(1, "batch")
+    ended = torch.rand(size, 1, generator=stream) < 0.3
+    after = {
+        "observation": torch.randn(size, D, generator=stream),
+        "reward": torch.randn(size, 1, generator=stream),
+        "terminated": ended,
+        "done": ended,
+    }
+    whole = {
+        "observation": torch.randn(size, D, generator=stream),
+        "action": torch.rand(size, A, generator=stream) * 2 - 1,
+        "next": TensorDict(after, batch_size=[size]),
+    }
+    return TensorDict(whole, batch_size=[size])
+
+
+def still(policy: SquashedPolicy, mean: float, log_std: float) -> None:
+    """Have the policy answer one mean and deviation, before the squashing, everywhere."""
+    last = policy.net[-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias[:A] = mean
+        last.bias[A:] = log_std
+
+
+def answer(critic: ActionValue, value: float) -> None:
+    last = critic.net[-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.fill_(value)
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_a_hand_worked_transition(ended: bool) -> None:
+    policy, critics = networks()
+    still(policy, mean=0.5, log_std=-1.0)
+    answer(critics[0], 2.0)
+    answer(critics[1], 3.0)
+    loss = sac_loss(policy, critics, temperature=0.3)
+    batch = batch_of(1)
+    batch["next", "reward"] = torch.tensor([[0.7]])
+    batch["next", "terminated"] = batch["next", "done"] = torch.tensor([[ended]])
+
+    # The action that is drawn next is tanh(0.5 + z / e), of density
+    # N(z) * e / (1 - tanh^2) in each of its entries.
+    noise = torch.randn(1, A, generator=torch_stream(0, "policy")).double()
+    action = torch.tanh(0.5 + math.exp(-1) * noise)
+    each = -(noise**2) / 2 - math.log(2 * math.pi) / 2 + 1 - torch.log(1 - action**2)
+    log_prob = float(each.sum())
+    target = 0.7 if ended else 0.7 + 0.9 * (2.0 - 0.3 * log_prob)
+    got = float(loss.critic_loss(batch).detach())
+    assert got == pytest.approx((2 - target) ** 2 + (3 - target) ** 2, rel=1e-4)
+
+    loss = sac_loss(policy, critics, temperature=0.3)  # its stream is at the start again
+    got_policy, got_temperature, entropy = loss.policy_and_temperature_loss(batch)
+    assert float(entropy) == pytest.approx(-log_prob, rel=1e-4)
+    assert float(got_policy.detach()) == pytest.approx(0.3 * log_prob - 2.0, rel=1e-4)
+    # The temperature falls while the entropy is above -2. TorchRL's loss is linear in its log.
+    [slope] = torch.autograd.grad(got_temperature, [loss.log_alpha])
+    assert float(slope) == pytest.approx(-log_prob + 2.0, rel=1e-4)
+
+
+def test_equals_torchrls_own_loss() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from tensordict.nn import TensorDictModule
+        from torchrl.objectives import SACLoss
+
+    policy, critics = networks()
+    ours = sac_loss(policy, critics)
+    theirs = SACLoss(
+        ours.actor_network,
+        [
+            TensorDictModule(critic, ["observation", "action"], ["state_action_value"])
+            for critic in networks()[1]
+        ],
+        loss_function="l2",
+        alpha_init=0.3,
+        target_entropy=-2.0,
+    )
+    theirs.make_value_estimator(gamma=0.9)
+    SoftUpdate(theirs, tau=0.01)
+    theirs.load_state_dict(ours.state_dict())
+    batch = batch_of(M)
+    before = torch.get_rng_state()
+
+    def like_ours(compute: Callable[[], Any]) -> Any:
+        torch.set_rng_state(ours._generator.get_state())
+        try:
+            return compute()
+        finally:
+            torch.set_rng_state(before)
+
+    close = {"rtol": 1e-4, "atol": 1e-6}
+    expected, _ = like_ours(lambda: theirs.qvalue_v2_loss(batch))
+    got = ours.critic_loss(batch)
+    torch.testing.assert_close(got, expected, **close)
+    torch.testing.assert_close(
+        gradients(got, ours.qvalue_network_params),
+        gradients(expected, theirs.qvalue_network_params),
+        **close,
+    )
+    expected, about = like_ours(lambda: theirs.actor_loss(batch))
+    got, temperature, entropy = ours.policy_and_temperature_loss(batch)
+    torch.testing.assert_close(got, expected, **close)
+    torch.testing.assert_close(
+        gradients(got, ours.actor_network_params),
+        gradients(expected, theirs.actor_network_params),
+        **close,
+    )
+    torch.testing.assert_close(entropy, -about["log_prob"].mean(), **close)
+    torch.testing.assert_close(temperature, theirs.alpha_loss(about["log_prob"]).mean(), **close)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def gradients(loss: Tensor, params: Any) -> list[Tensor]:
+    return list(torch.autograd.grad(loss, list(params.parameters()), retain_graph=True))
+
+
+def test_the_lowest_of_any_number_of_critics_counts() -> None:
+    for values in ([1.0], [3.0, 1.0, 2.0]):
+        policy, critics = networks(len(values))
+        for critic, value in zip(critics, values, strict=True):
+            answer(critic, value)
+        loss, _, _ = sac_loss(policy, critics, temperature=1e-9).policy_and_temperature_loss(
+            batch_of(4)
+        )
+        assert float(loss.detach()) == pytest.approx(-1.0)
+
+
+# The policy.
+
+
+def squashed(bias: Tensor | None = None, log_std: float = -1.0) -> SquashedPolicy:
+    cfg = SquashedCfg("squashed", D, A, [16, 8], log_std, 10.0)
+    return SquashedPolicy(cfg, torch_stream(0, "weights"), bias)
+
+
+def test_actions_are_squashed() -> None:
+    policy = squashed(torch.tensor([0.9, -0.9]), log_std=0.5)
+    obs = torch.randn(1000, D, generator=torch_stream(0, "obs"))
+    action, mean = policy.sample(obs, torch_stream(0, "actions"))
+    assert float(action.abs().max()) <= 1
+    assert float(action[:, 0].min()) < -0.5  # and yet it spreads
+    assert float(mean.abs().max()) < 1
+
+
+def test_a_sample_is_the_squashed_mean_and_noise() -> None:
+    policy = squashed()
+    obs = torch.randn(3, D, generator=torch_stream(0, "obs"))
+    loc, scale = policy(obs)
+    noise = torch.randn(3, A, generator=torch_stream(0, "actions"))
+    action, mean = policy.sample(obs, torch_stream(0, "actions"))
+    torch.testing.assert_close(mean, torch.tanh(loc.detach()))
+    torch.testing.assert_close(action, torch.tanh(loc + scale * noise).detach())
+    # It starts at the deviation it was given: exp(-1).
+    torch.testing.assert_close(scale, torch.full((3, A), math.exp(-1)), rtol=0.05, atol=0)
+
+
+def test_it_starts_at_the_warm_start() -> None:
+    obs = torch.randn(16, D, generator=torch_stream(0, "obs"))
+    mean = squashed(torch.tensor([0.25, -0.5])).act(obs, deterministic=True)
+    torch.testing.assert_close(mean, torch.tensor([0.25, -0.5]).expand(16, 2), rtol=0, atol=0.02)
+    # Where tanh is flat it would never come away again.
+    mean = squashed(torch.tensor([1.0, -3.0])).act(obs, deterministic=True)
+    torch.testing.assert_close(mean, torch.tensor([0.95, -0.95]).expand(16, 2), rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize(("warm", "start"), [(True, [0.25, -0.5]), (False, [0.0, 0.0])])
+def test_the_warm_start_can_be_left_out(warm: bool, start: list[float]) -> None:
+    trainer = Trainer(PointEnv(), trainer_cfg(replace(TOY_SAC, warm_start=warm)))
+    mean = trainer.model.act(torch.zeros(1, D), deterministic=True)
+    torch.testing.assert_close(mean, torch.tensor([start]), rtol=0, atol=0.02)
+
+
+def test_sampled_and_deterministic_actions() -> None:
+    policy = squashed()
+    obs = torch.randn(4, D, generator=torch_stream(0, "obs"))
+    assert torch.equal(policy.act(obs, deterministic=True), policy.act(obs, deterministic=True))
+    first = policy.act(obs, torch_stream(0, "a"))
+    assert torch.equal(policy.act(obs, torch_stream(0, "a")), first)
+    assert not torch.equal(policy.act(obs, torch_stream(1, "a")), first)
+    assert not torch.equal(policy.act(obs, deterministic=True), first)
+    with pytest.raises(RunError, match="needs a generator"):
+        policy.act(obs)
