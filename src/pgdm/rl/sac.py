@@ -215,7 +215,7 @@ class SACLearner:
     def _update(self) -> None:
         batch = self._batch()
         self._updates += 1
-        self._loss.target_entropy.fill_(self._target_entropy())
+        self._loss.steer_to(self._target_entropy())
         with self._precision():
             critic_loss = self._loss.critic_loss(batch)
         logged = {"loss_critic": critic_loss.detach()}

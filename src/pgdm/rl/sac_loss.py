@@ -92,6 +92,11 @@ class SoftActorCriticLoss(SACLoss):
         self.make_value_estimator(estimator, gamma=gamma)
         self._generator = generator
 
+    def steer_to(self, entropy: float) -> None:
+        """Change the entropy that the temperature steers to, nat."""
+        target: Any = self.target_entropy  # a buffer
+        target.fill_(entropy)
+
     def critic_loss(self, batch: TensorDict) -> Tensor:
         """Return the squared error () of all critics, summed over them."""
         with _drawing_from(self._generator):
