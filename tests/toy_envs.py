@@ -60,6 +60,8 @@ TOY_SAC = SACCfg(
     updates_per_step=1,
     actor_interval=2,
     target_entropy=-1.0,
+    target_entropy_end=-1.0,
+    target_entropy_frames=1000,
     temperature_init=0.05,
     warmup_steps=16,
     bfloat16=False,
@@ -127,7 +129,6 @@ class PointEnv:
             "final_obs": self._obs(),
             "terms": {"near": reward},
             "raw_terms": {"near": near},
-            "discount": None,
             "episodes": None,
         }
         if done.any():
@@ -209,7 +210,7 @@ class ScriptedEnv:
         obs = torch.where(done[:, None], -final, final)  # after a restart: the negative
         terms = {"script": self._reward[t]}
         info = {"final_obs": final, "terms": terms, "raw_terms": terms}
-        info |= {"discount": None, "episodes": None}
+        info["episodes"] = None
         return obs, self._reward[t], self._terminated[t], self._truncated[t], info
 
     def _obs(self) -> Tensor:
@@ -250,5 +251,5 @@ class FreeEnv(ScriptedEnv):
         reward = self._rewards[self.t % 16]
         terms = {"script": reward}
         info = {"final_obs": obs, "terms": terms, "raw_terms": terms}
-        info |= {"discount": None, "episodes": None}
+        info["episodes"] = None
         return obs, reward, self._no, self._no, info

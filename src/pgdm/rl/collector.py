@@ -151,8 +151,8 @@ class Collector:
         obs, reward, terminated, truncated, info = result()
         rollout.obs[t + 1], rollout.reward[t] = obs, reward
         rollout.terminated[t], rollout.truncated[t] = terminated, truncated
-        if info["discount"] is not None:
-            rollout.discount[t] = info["discount"]
+        if (discount := info.get("discount")) is not None:
+            rollout.discount[t] = discount
         # A sum is finite only if all its parts are, and costs a tenth of looking at each.
         if not math.isfinite(float(reward.sum()) + float(obs.sum())):
             _check_finite(t, obs, reward, info)

@@ -164,7 +164,7 @@ class SACLearner:
 
     def after_step(self, step: Step) -> None:
         """Append a step to the replay, and its observations to their statistics."""
-        info, discount = step.info, step.info["discount"]
+        info, discount = step.info, step.info.get("discount")
         self._replay.append(
             {
                 "observation": step.obs,

@@ -28,15 +28,16 @@ __all__ = ["SoftActorCriticLoss", "SoftUpdate", "TensorDict"]
 
 
 class DiscountedTD0(TD0Estimator):
-    """The one-step target r + gamma d V', d being the environment's own ``discount`` (M, 1)."""
+    """The one-step target r + gamma d V', d being the environment's ``discount`` (M, 1), or 1."""
 
     def value_estimate(self, tensordict: Any, *args: Any, **kwargs: Any) -> Tensor:
         """Return the target, (M, 1)."""
         after = tensordict["next"]
-        value = after[self.tensor_keys.value] * after["discount"]
-        discounted = tensordict.copy()
-        discounted["next"] = after.copy().set(self.tensor_keys.value, value)
-        return super().value_estimate(discounted, *args, **kwargs)
+        if (discount := after.get("discount", None)) is not None:
+            key = self.tensor_keys.value
+            tensordict = tensordict.copy()
+            tensordict["next"] = after.copy().set(key, after[key] * discount)
+        return super().value_estimate(tensordict, *args, **kwargs)
 
 
 class SoftActorCriticLoss(SACLoss):
@@ -89,7 +90,7 @@ class SoftActorCriticLoss(SACLoss):
             deactivate_vmap=True,
         )
         estimator: Any = DiscountedTD0  # TorchRL takes a class as well as a name
-        self.make_value_estimator(estimator, gamma=gamma)
+        self.make_value_estimator(estimator, value_network=None, gamma=gamma)
         self._generator = generator
 
     def steer_to(self, entropy: float) -> None:

@@ -50,7 +50,7 @@ class VecEnv(Protocol):
             last observations, ``episodes``, those that finished (`Finished`) in the order of
             their rows, or None, and {name: (N,)} of the reward terms, ``raw_terms`` before and
             ``terms`` after weighting; ``discount`` (N,) in [0, 1], by which what comes after the
-            step counts less, or None for 1.
+            step counts less, or None, or nothing, for 1.
         """
         ...
 
