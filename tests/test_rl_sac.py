@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pgdm.errors import ConfigError, RunError
 from pgdm.rl.callback import Callback, Progress
-from pgdm.rl.collector import Step
+from pgdm.rl.collector import Rollout, Step
 from pgdm.rl.evaluate import Evaluator
 from pgdm.rl.networks import ActionValue, SquashedCfg, SquashedPolicy
 from pgdm.rl.sac import SACCfg, SACLearner, columns
@@ -131,8 +131,8 @@ def test_the_replay_is_as_large_as_it_says(tmp_path: Path) -> None:
     cfg = trainer_cfg(SHORT, total_frames=100)  # 2 iterations of 64
     Trainer(env, cfg, Extras(replay_folder=tmp_path / "replay")).run()
     on_disk = sum(path.stat().st_size for path in (tmp_path / "replay").iterdir())
-    # 5 + 5 observations and 2 actions of 2 bytes, 1 term of 4 bytes, 1 byte of the end.
-    assert on_disk == SHORT.disk_bytes(env, 100) == 128 * (2 * (5 + 5 + 2) + 4 + 1)
+    # 5 + 5 observations and 2 actions of 2 bytes, term and discount of 4, 1 byte of the end.
+    assert on_disk == SHORT.disk_bytes(env, env.num_envs, 100) == 128 * (2 * 12 + 2 * 4 + 1)
 
 
 # One update.
@@ -235,6 +235,7 @@ def test_columns_have_room_for_all_terms() -> None:
         "observation": (D,),
         "action": (A,),
         "terms": (3,),
+        "discount": (),
         "terminated": (),
         "next_observation": (D,),
     }
@@ -252,6 +253,16 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing() -> None:
     after = learner.state_dict()
     for part in ("model", "loss", "optimizers"):
         assert flat(after[part]) == flat(before[part])
+
+
+def test_a_weight_that_is_not_finite_is_told_before_anything_is_saved() -> None:
+    env = PointEnv()
+    trainer = Trainer(env, trainer_cfg(SHORT))
+    with torch.no_grad():
+        next(trainer._learner.model.parameters()).fill_(math.nan)
+    rollout = Rollout.empty(1, env)
+    with pytest.raises(RunError, match="a weight is not finite .*the last checkpoint is good"):
+        trainer._learner.learn(rollout)
 
 
 # The loss.
@@ -311,8 +322,10 @@ def answer(critic: ActionValue, value: float) -> None:
         last.bias.fill_(value)
 
 
-@pytest.mark.parametrize("ended", [False, True])
-def test_a_hand_worked_transition(ended: bool) -> None:
+@pytest.mark.parametrize(
+    ("ended", "discount"), [(False, None), (False, 0.25), (True, None), (True, 0.25)]
+)
+def test_a_hand_worked_transition(ended: bool, discount: float | None) -> None:
     policy, critics = networks()
     still(policy, mean=0.5, log_std=-1.0)
     answer(critics[0], 2.0)
@@ -321,6 +334,8 @@ def test_a_hand_worked_transition(ended: bool) -> None:
     batch = batch_of(1)
     batch["next", "reward"] = torch.tensor([[0.7]])
     batch["next", "terminated"] = batch["next", "done"] = torch.tensor([[ended]])
+    if discount is not None:  # as the environment's soft end gives it
+        batch["next", "discount"] = torch.tensor([[discount]])
 
     # The action that is drawn next is tanh(0.5 + z / e), of density
     # N(z) * e / (1 - tanh^2) in each of its entries.
@@ -328,7 +343,8 @@ def test_a_hand_worked_transition(ended: bool) -> None:
     action = torch.tanh(0.5 + math.exp(-1) * noise)
     each = -(noise**2) / 2 - math.log(2 * math.pi) / 2 + 1 - torch.log(1 - action**2)
     log_prob = float(each.sum())
-    target = 0.7 if ended else 0.7 + 0.9 * (2.0 - 0.3 * log_prob)
+    gamma = 0.9 if discount is None else 0.9 * discount
+    target = 0.7 if ended else 0.7 + gamma * (2.0 - 0.3 * log_prob)
     got = float(loss.critic_loss(batch).detach())
     assert got == pytest.approx((2 - target) ** 2 + (3 - target) ** 2, rel=1e-4)
 
@@ -339,6 +355,18 @@ def test_a_hand_worked_transition(ended: bool) -> None:
     # The temperature falls while the entropy is above -2. TorchRL's loss is linear in its log.
     [slope] = torch.autograd.grad(got_temperature, [loss.log_alpha])
     assert float(slope) == pytest.approx(-log_prob + 2.0, rel=1e-4)
+
+
+def test_the_entropy_target_falls_over_the_frames_seen() -> None:
+    # From -1 to -3 nat an entry over 80 frames, 8 a step: after 2 steps -1.4, after 12 -3.
+    cfg = replace(SHORT, warmup_steps=1, target_entropy=-1.0, target_entropy_end=-3.0)
+    env = PointEnv()
+    learner = build(env, replace(cfg, target_entropy_frames=80))
+    for steps, expected in ((2, -1.4), (10, -3.0)):
+        for _ in range(steps):
+            learner.after_step(one_step(env))
+        learner.during_step()
+        assert float(learner._loss.target_entropy) == pytest.approx(expected * env.action_dim)
 
 
 def test_equals_torchrls_own_loss() -> None:

@@ -108,7 +108,7 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
 def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
     """Return sentences on what in a run is not as one might think."""
     late = builder.mdp.recipe.unfinished(cfg.total_frames)
-    disk = cfg.algo.disk_bytes(builder.make(cfg.num_envs, 1), cfg.total_frames)
+    disk = cfg.algo.disk_bytes(builder.make(1, 1), cfg.num_envs, cfg.total_frames)
     kept = "it is kept" if cfg.keep_replay else "removed when the run has finished"
     return [
         *builder.notes,

@@ -42,7 +42,7 @@ class AlgoCfg:
             ConfigError: with the values, if they do not fit.
         """
 
-    def disk_bytes(self, env: VecEnv, total_frames: int) -> int:
+    def disk_bytes(self, env: VecEnv, num_envs: int, total_frames: int) -> int:
         """Return the bytes that a training of so many frames keeps on the disk as it goes."""
         return 0
 

@@ -65,10 +65,10 @@ class SACCfg(AlgoCfg):
         per_iteration = num_envs * self.steps_per_env
         return -(-total_frames // per_iteration) * per_iteration
 
-    def disk_bytes(self, env: VecEnv, total_frames: int) -> int:
+    def disk_bytes(self, env: VecEnv, num_envs: int, total_frames: int) -> int:
         """Return the size of the replay, bytes."""
         frame = sum(column.nbytes for column in columns(env).values())
-        return frame * self.capacity(env.num_envs, total_frames)
+        return frame * self.capacity(num_envs, total_frames)
 
 
 class SACLearner:
@@ -180,6 +180,11 @@ class SACLearner:
     def learn(self, rollout: Rollout) -> dict[str, float]:
         """Return the means of what the iteration's updates logged."""
         logged, self._logged = self._logged, []
+        if not math.isfinite(sum(float(p.detach().sum()) for p in self._loss.parameters())):
+            raise RunError(
+                "a weight is not finite after the iteration's updates; nothing was saved, the last "
+                "checkpoint is good: try a lower algo.learning_rate"
+            )
         names = {name for one in logged for name in one}
         return {
             name: float(torch.stack([one[name] for one in logged if name in one]).mean())
