@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from command_line import TINY, command, process
+from command_line import TINY, TINY_SAC, command, process
 from pgdm.config.store import compose
 from pgdm.config.suites import expand_tasks
 from pgdm.sweep.expand import grid
@@ -94,7 +94,7 @@ def _follow(heading: str, folder: Path, page: str = "extending.md") -> None:
 
 def test_recipe_for_a_suite_of_settings(tmp_path: Path) -> None:
     _follow("A suite of settings", tmp_path)
-    cfg = compose(["+experiment=fast", "task=cup-pour1"], tmp_path / "my")
+    cfg = compose(["+experiment=ours", "task=cup-pour1"], tmp_path / "my")
     assert (cfg.action.kind, cfg.algo.name, cfg.total_frames) == ("residual", "ppo_fast", 1_000_000)
     assert cfg.task.id == "cup-pour1"
 
@@ -140,8 +140,9 @@ def test_recipes_for_an_object_and_its_task(
     for words in made:
         outcome = command("pgdm", *words)
         assert outcome.code == 0, outcome.err
-    run = ["task=wedge-slide", "action=residual", "algo=ppo_fast"]
-    done = command("pgdm-run", *run, *TINY, "--offline", "run_dir=run")
+    done = command(
+        "pgdm-run", "+experiment=fast", "task=wedge-slide", *TINY_SAC, "--offline", "run_dir=run"
+    )
     assert done.code == 0, done.err
     assert command("pgdm", "author", "remove", "wedge-slide", "--yes").code == 0
 
@@ -162,8 +163,9 @@ def test_the_worked_example_of_authoring(tmp_path: Path, library_home: Path) -> 
     for words in _author_commands("authoring.md", "A worked example"):
         outcome = command("pgdm", *words)
         assert outcome.code == 0, outcome.err
-    run = ["task=pawn-lift", "action=residual", "algo=ppo_fast"]
-    done = command("pgdm-run", *run, *TINY, "--offline", "run_dir=run")
+    done = command(
+        "pgdm-run", "+experiment=fast", "task=pawn-lift", *TINY_SAC, "--offline", "run_dir=run"
+    )
     assert done.code == 0, done.err
 
 

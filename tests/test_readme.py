@@ -39,11 +39,11 @@ QUICK = (
 )
 
 # Run here, in this order and in one folder, with a smaller budget: command -> what is run.
-CUP = "pgdm-run task=cup-pour1 action=residual algo=ppo_fast"
+CUP = "pgdm-run +experiment=fast task=cup-pour1"
 SMALL = "total_frames=8192 eval.episodes=2"
 WALK = {
     "make run": f'{MAKE_RUN} ARGS="{SMALL} tracking=none run_dir=$PWD/runs/quickstart"',
-    f"{CUP} total_frames=1_000_000 run_dir=runs/cup": f"{CUP} {SMALL} run_dir=runs/cup",
+    f"{CUP} run_dir=runs/cup": f"{CUP} {SMALL} run_dir=runs/cup",
     "pgdm eval runs/cup --video": "pgdm eval runs/cup --video --episodes 2",
     "pgdm runs": "pgdm runs",
     "pgdm view cup-pour1 --video cup.mp4": "pgdm view cup-pour1 --video cup.mp4",

@@ -261,7 +261,7 @@ def test_a_weight_that_is_not_finite_is_told_before_anything_is_saved() -> None:
     with torch.no_grad():
         next(trainer._learner.model.parameters()).fill_(math.nan)
     rollout = Rollout.empty(1, env)
-    with pytest.raises(RunError, match="a weight is not finite .*the last checkpoint is good"):
+    with pytest.raises(RunError, match=r"a weight is not finite .*the last checkpoint is good"):
         trainer._learner.learn(rollout)
 
 
