@@ -42,7 +42,16 @@ from pgdm.experiment import env_builder
 from pgdm.library import open_library
 from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.loss import Samples, policy_loss, value_loss
-from pgdm.rl.networks import ActorCritic, NetworkCfg, gaussian_log_prob
+from pgdm.rl.networks import (
+    ActionValue,
+    ActorCritic,
+    NetworkCfg,
+    SquashedCfg,
+    SquashedPolicy,
+    gaussian_log_prob,
+)
+from pgdm.rl.sac import SACCfg
+from pgdm.rl.sac_loss import SoftActorCriticLoss, TensorDict
 from pgdm.rl.trainer import Extras, Trainer, TrainerCfg
 from pgdm.tracking.provenance import versions
 
@@ -180,16 +189,19 @@ class Clock(Callback):
         self._since = time.perf_counter()
 
 
-def train(builder: EnvBuilder, cfg: ExperimentCfg) -> tuple[float, float]:
+def train(builder: EnvBuilder, cfg: ExperimentCfg, overlap: bool = True) -> tuple[float, float]:
     """Return steps/s of collecting and learning, and of the bare physics doing the same steps.
 
-    Evaluation and saving are left out; the first iteration warms up.
+    Evaluation and saving are left out; the first iteration warms up. Without ``overlap`` soft
+    actor-critic learns while no simulation moves; each then has the machine to itself.
     """
     threads = len(os.sched_getaffinity(0))
     frames = cfg.num_envs * cfg.algo.steps_per_env
     env = builder.make(cfg.num_envs, threads)
     clock = Clock(builder, env)
-    trainer_cfg = TrainerCfg(cfg.algo, 0, frames * (ITERATIONS + 1), None, 0, 1e9, "cpu", threads)
+    trainer_cfg = TrainerCfg(
+        cfg.algo, 0, frames * (ITERATIONS + 1), None, 0, 1e9, "cpu", threads if overlap else 1
+    )
     Trainer(env, trainer_cfg, Extras(callbacks=[clock])).run()
     done = frames * ITERATIONS
     return done / sum(clock.training_s[1:]), done / sum(clock.bare_s[1:])
@@ -234,6 +246,41 @@ def gradient_step_ms(cfg: ExperimentCfg) -> tuple[float, float]:
     return 1e3 * spent[ours] / STEPS, 1e3 * spent[torchrls] / STEPS
 
 
+def critic_gradient_ms(cfg: ExperimentCfg) -> tuple[float, float]:
+    """Return ms of one batch's critic loss and gradient, critics one by one and under vmap."""
+    algo, generator = cfg.algo, torch.Generator().manual_seed(0)
+    assert isinstance(algo, SACCfg)
+    m, obs_dim, action_dim = algo.batch_size, 322, 30
+    network = SquashedCfg("squashed", obs_dim, action_dim, list(algo.hidden), -1.6, 10.0)
+    policy = SquashedPolicy(network, generator)
+    critics = [ActionValue(obs_dim, action_dim, algo.hidden, generator) for _ in range(2)]
+    after = {name: torch.zeros(m, 1, dtype=torch.bool) for name in ("done", "terminated")}
+    after |= {"observation": torch.randn(m, obs_dim), "reward": torch.rand(m, 1)}
+    columns = {"observation": torch.randn(m, obs_dim), "action": torch.rand(m, action_dim)}
+    batch = TensorDict({**columns, "next": TensorDict(after, batch_size=m)}, batch_size=m)
+    spent = []
+    for vmap in (False, True):
+        loss = SoftActorCriticLoss(
+            policy,
+            critics,
+            gamma=algo.gamma,
+            temperature=0.01,
+            target_entropy=-30.0,
+            generator=generator,
+        )
+        loss.deactivate_vmap = not vmap
+        loss._make_vmap()
+        params, times = list(loss.qvalue_network_params.parameters()), []
+        for _ in range(STEPS):
+            start = time.perf_counter()
+            with torch.autocast("cpu", dtype=torch.bfloat16, enabled=algo.bfloat16):
+                value = loss.critic_loss(batch)
+            torch.autograd.grad(value, params)
+            times.append(time.perf_counter() - start)
+        spent.append(1e3 * statistics.median(times))
+    return spent[0], spent[1]
+
+
 def first_step_s(task: str) -> float:
     """Return s from a fresh process's import to its first step."""
     code = FIRST_STEP.format(task=task)
@@ -241,11 +288,14 @@ def first_step_s(task: str) -> float:
     return float(done.stdout)
 
 
-def peak_memory_mib(task: str) -> float:
-    """Return the largest resident memory of a short `pgdm-run` with a film."""
+def peak_memory_mib(task: str, *overrides: str) -> float:
+    """Return the largest resident memory of a short `pgdm-run` with a film.
+
+    The pages of a replay that are in memory count; the system takes them back when it needs them.
+    """
     with tempfile.TemporaryDirectory() as folder:
         command = [str(Path(sys.executable).with_name("pgdm-run")), f"task={task}", "--offline"]
-        command += [f"run_dir={folder}/run", "total_frames=8192"]
+        command += [f"run_dir={folder}/run", "total_frames=8192", *overrides]
         subprocess.run(command, cwd=folder, capture_output=True, check=True)
     return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
 
@@ -266,17 +316,22 @@ def measure(task: str, rounds: int, console: Console) -> dict[str, list[float]]:
             note("bare", STEPS * NUM_ENVS / in_bare)
             note("make_batch", STEPS * NUM_ENVS / in_env)
             note("make_batch / bare", in_bare / in_env)
-            for algo in ("ppo", "ppo_fast"):
+            for algo, overlap in (("ppo", True), ("ppo_fast", True), ("sac", True), ("sac", False)):
                 cfg = compose([f"task={task}", f"algo={algo}"])
-                trained, bare = train(builder, cfg)
-                note(f"training {algo}", trained)
-                note(f"bare, the steps of training {algo}", bare)
-                note(f"training {algo} / bare", trained / bare)
+                trained, bare = train(builder, cfg, overlap)
+                name = algo if overlap else f"{algo}, physics and updates in turn"
+                note(f"training {name}", trained)
+                note(f"bare, the steps of training {name}", bare)
+                note(f"training {name} / bare", trained / bare)
+            one_by_one, under_vmap = critic_gradient_ms(compose([f"task={task}", "algo=sac"]))
+            note("loss and gradient of SAC's critics, one thread (ms)", one_by_one)
+            note("the same under TorchRL's vmap (ms)", under_vmap)
             own, torchrls = gradient_step_ms(compose([f"task={task}"]))
             note("loss and gradient, one thread (ms)", own)
             note("the same by TorchRL's ClipPPOLoss (ms)", torchrls)
             note("import to first step (s)", first_step_s(task))
             note("peak memory of a run (MiB)", peak_memory_mib(task))
+            note("peak memory of a run with algo=sac (MiB)", peak_memory_mib(task, "algo=sac"))
     return figures
 
 

@@ -140,6 +140,7 @@ def _options(cfg: ExperimentCfg) -> dict[str, str]:
     return {
         "action": cfg.action.kind,
         "algo": cfg.algo.name,
+        "shaping": cfg.shaping.name,
         "obs": cfg.obs.layout,
         "reference": cfg.reference.frame,
         "method": cfg.method.name,

@@ -22,6 +22,7 @@ GROUPS = {
     "pregrasp": "pregrasp.source",
     "action": "action.kind",
     "algo": "algo.name",
+    "shaping": "shaping.name",
     "obs": "obs.layout",
     "reference": "reference.frame",
     "hand": "hand.name",

@@ -230,7 +230,7 @@ class SACLearner:
                 policy, temperature, entropy = self._loss.policy_and_temperature_loss(batch)
             logged |= {
                 "loss_policy": policy.detach(),
-                "entropy": entropy / self._env.action_dim,
+                "entropy": entropy,
                 "temperature": self._loss.log_alpha.detach().exp(),
             }
             self._step("policy", policy)
