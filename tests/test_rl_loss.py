@@ -34,7 +34,6 @@ def gae(
     cuts: Tensor,
     discount: Tensor | None = None,
 ) -> Tensor:
-    discount = torch.ones(reward.shape) if discount is None else discount
     advantage, target = advantages(
         values, following, reward, ends, cuts, discount, gamma=0.5, gae_lambda=0.5
     )

@@ -64,7 +64,7 @@ class Rollout:
     """(T, N) bool, nothing came after."""
     truncated: Tensor
     """(T, N) bool, the episode was cut."""
-    discount: Tensor
+    discount: Tensor | None = None
     """(T, N) in [0, 1], by how much what comes after the step counts less, besides gamma."""
     last_obs: list[tuple[int, Tensor, Tensor]] = field(default_factory=list)
     """Of each step with truncated rows: t, the rows (k,), their true last observations (k, D)."""
@@ -82,7 +82,6 @@ class Rollout:
             reward=torch.zeros(steps, n),
             terminated=torch.zeros(steps, n, dtype=torch.bool),
             truncated=torch.zeros(steps, n, dtype=torch.bool),
-            discount=torch.ones(steps, n),
         )
 
     def metrics(self) -> dict[str, float]:
@@ -152,6 +151,8 @@ class Collector:
         rollout.obs[t + 1], rollout.reward[t] = obs, reward
         rollout.terminated[t], rollout.truncated[t] = terminated, truncated
         if (discount := info.get("discount")) is not None:
+            if rollout.discount is None:
+                rollout.discount = torch.ones_like(rollout.reward)
             rollout.discount[t] = discount
         # A sum is finite only if all its parts are, and costs a tenth of looking at each.
         if not math.isfinite(float(reward.sum()) + float(obs.sum())):

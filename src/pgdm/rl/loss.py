@@ -97,7 +97,7 @@ def advantages(
     reward: Tensor,
     terminated: Tensor,
     truncated: Tensor,
-    discount: Tensor,
+    discount: Tensor | None,
     *,
     gamma: float,
     gae_lambda: float,
@@ -111,12 +111,11 @@ def advantages(
         reward: (T, N).
         terminated: nothing came after, (T, N) bool.
         truncated: the episode was cut there, (T, N) bool.
-        discount: by how much what comes after the step counts less, besides gamma, (T, N).
+        discount: by how much what comes after the step counts less, besides gamma, (T, N), or
+            None for 1.
         gamma: discount per step.
         gae_lambda: decay of the longer estimates.
     """
-    # TorchRL asks for a number, and takes one for each step as well.
-    discounts: Any = gamma * discount.t().unsqueeze(-1)
     with warnings.catch_warnings():
         # Imported here, and quietly, because it costs 2 s, and warns that its compiled part (which
         # nothing here uses) was built for another torch.
@@ -126,10 +125,12 @@ def advantages(
     def layout(x: Tensor) -> Tensor:  # (T, N) -> (N, T, 1)
         return x.t().unsqueeze(-1)
 
+    # TorchRL asks for a number, and takes one for each step as well.
+    gammas: Any = gamma if discount is None else gamma * layout(discount)
     # A value that is not finite would survive the multiplication with 0 that switches it off.
     following = next_values.masked_fill(terminated, 0.0)
     advantage, target = generalized_advantage_estimate(
-        discounts,
+        gammas,
         gae_lambda,
         layout(values),
         layout(following),
