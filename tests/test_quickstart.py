@@ -12,11 +12,13 @@ from command_line import process
 
 @pytest.mark.slow
 def test_the_quickstart_learns_to_swing_the_hammer(library_home: Path, tmp_path: Path) -> None:
-    # Half its length: enough to see it learn, and the same program.
+    # A third of its length: enough to see it learn, and the same program, without its limit of
+    # time, so that a slow machine learns as much.
     outcome = process(
         "pgdm-run",
         "+experiment=quickstart",
-        "total_frames=262_144",
+        "total_frames=100_000",
+        "time_limit_min=null",
         "--offline",
         "run_dir=run",
         timeout_s=2400,
@@ -28,6 +30,6 @@ def test_the_quickstart_learns_to_swing_the_hammer(library_home: Path, tmp_path:
     # Well below what was measured: a run depends on the processor's rounding.
     assert reached["eval_deterministic/lifted"] >= 0.9
     assert reached["eval_deterministic/length"] >= 80
-    assert reached["eval_deterministic/com_error"] <= 0.12  # m, 0.18 before training
-    assert reached["eval_deterministic/return"] >= 200  # 17 before training
+    assert reached["eval_deterministic/com_error"] <= 0.06  # m, 0.19 before training
+    assert reached["eval_deterministic/return"] >= 250  # 17 before training
     assert (run / result["video"]).stat().st_size > 10_000

@@ -190,7 +190,7 @@ class Run(Callback):
         self.cfg, self.builder, self.dir, self._notify = cfg, builder, run_dir, notify
         self._log = RunLog(run_dir / "metrics.jsonl")
         self._checkpoints = CheckpointFolder(run_dir / "checkpoints", cfg.checkpoint.keep_last)
-        self._facts = {**builder.facts(), "git": git_revision()}
+        self._facts = {**builder.facts(), "shaping": cfg.shaping.name, "git": git_revision()}
         self._tracker: Tracker | None = None
         self._trainer: Trainer | None = None
 
