@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import resource
@@ -14,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -26,7 +28,7 @@ from pgdm.seeding import torch_stream
 
 COLUMNS = {
     "obs": Column(torch.float16, (3,)),
-    "terms": Column(torch.float32, (2,)),
+    "terms": Column(torch.float32, (2,), ("near", "far")),
     "ended": Column(torch.bool),
 }
 FRAME = 3 * 2 + 2 * 4 + 1
@@ -361,3 +363,14 @@ def test_a_file_system_that_cannot_reserve_is_written_instead(tmp_path: Path) ->
         again = replay(disk / "replay", capacity=100)  # growing keeps what is there
         again.load_state_dict(state)
         assert_holds(again, frames(0, 30))
+
+
+def test_the_files_can_be_read_without_pgdm(tmp_path: Path) -> None:
+    stored, shown = replay(tmp_path), frames(0, 5)
+    stored.append(shown)
+    about = json.loads((tmp_path / "columns.json").read_text())
+    for name, column in about.items():
+        whole = np.memmap(tmp_path / column["file"], column["dtype"], "r")
+        seen = whole.reshape(-1, *column["shape"][1:])[:5]
+        assert np.array_equal(seen, shown[name].to(COLUMNS[name].dtype).numpy())
+    assert about["terms"]["entries"] == ["near", "far"]

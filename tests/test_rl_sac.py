@@ -130,7 +130,7 @@ def test_the_replay_is_as_large_as_it_says(tmp_path: Path) -> None:
     env = PointEnv()
     cfg = trainer_cfg(SHORT, total_frames=100)  # 2 iterations of 64
     Trainer(env, cfg, Extras(replay_folder=tmp_path / "replay")).run()
-    on_disk = sum(path.stat().st_size for path in (tmp_path / "replay").iterdir())
+    on_disk = sum(path.stat().st_size for path in (tmp_path / "replay").glob("*.bin"))
     # 5 + 5 observations and 2 actions of 2 bytes, term and discount of 4, 1 byte of the end.
     assert on_disk == SHORT.disk_bytes(env, env.num_envs, 100) == 128 * (2 * 12 + 2 * 4 + 1)
 

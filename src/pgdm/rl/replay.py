@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 import shutil
@@ -17,13 +18,14 @@ import torch
 from torch import Tensor
 
 from pgdm.errors import CheckpointError, RunError
+from pgdm.paths import replacing
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # torchrl's compiled part, unused here, is of another torch
     from tensordict import MemoryMappedTensor, TensorDict
     from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
-_SUFFIX = ".bin"
+_SUFFIX, _ABOUT = ".bin", "columns.json"
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Column:
 
     dtype: torch.dtype
     shape: tuple[int, ...] = ()
+    entries: tuple[str, ...] = ()
+    """Names of a vector's entries, for who reads the file."""
 
     @property
     def nbytes(self) -> int:
@@ -72,6 +76,7 @@ class Replay:
             data = {n: torch.zeros(capacity, *c.shape, dtype=c.dtype) for n, c in columns.items()}
         else:
             self._made = _reserve(folder, self.columns, capacity)
+            _describe(folder, self.columns)
             data = {
                 name: MemoryMappedTensor.from_filename(
                     str(folder / f"{name}{_SUFFIX}"), c.dtype, torch.Size((capacity, *c.shape))
@@ -161,6 +166,21 @@ class Replay:
 
     def _files(self) -> list[Path]:
         return [] if self.folder is None else sorted(self.folder.glob(f"*{_SUFFIX}"))
+
+
+def _describe(folder: Path, columns: Mapping[str, Column]) -> None:
+    """Write down what the files hold, for who reads them without pgdm."""
+    about = {
+        name: {
+            "file": f"{name}{_SUFFIX}",
+            "dtype": str(column.dtype).removeprefix("torch."),
+            "shape": ["frames", *column.shape],
+            **({"entries": list(column.entries)} if column.entries else {}),
+        }
+        for name, column in columns.items()
+    }
+    with replacing(folder / _ABOUT) as temp:
+        temp.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
 
 
 def _reserve(folder: Path, columns: Mapping[str, Column], capacity: int) -> list[Path]:

@@ -297,10 +297,11 @@ def columns(env: VecEnv) -> dict[str, Column]:
     """
     from pgdm.rl.replay import Column
 
+    terms = tuple(env.reward_weights())
     return {
         "observation": Column(torch.float16, (env.obs_dim,)),
         "action": Column(torch.float16, (env.action_dim,)),
-        "terms": Column(torch.float32, (len(env.reward_weights()),)),
+        "terms": Column(torch.float32, (len(terms),), terms),
         "discount": Column(torch.float32),
         "terminated": Column(torch.bool),
         "next_observation": Column(torch.float16, (env.obs_dim,)),
