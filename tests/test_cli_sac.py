@@ -14,7 +14,7 @@ from pgdm.experiment import env_builder
 from pgdm.library import open_library
 from pgdm.tracking.run_folder import read_json
 
-FILES = {"observation", "action", "terms", "terminated", "next_observation"}
+FILES = {"observation", "action", "terms", "discount", "terminated", "next_observation"}
 
 
 def sac_run(*arguments: str) -> Outcome:
