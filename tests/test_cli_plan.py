@@ -50,8 +50,15 @@ def test_a_dry_run_shows_the_plan_and_leaves_nothing(tmp_path: Path) -> None:
     assert rows["differ in"] == "obs, seed, task"
     assert rows["frames"] == "8,192 a job, 196,608 in all, 196,608 to do"
     assert "which is assumed: no earlier run like these lies in" in rows["time"]
+    assert "disk" not in rows
     assert "nothing was started" in outcome.out
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plan_with_replays_says_what_they_take_and_that_they_are_slower() -> None:
+    rows = shown(command("pgdm-run", *SMALL, "algo=sac", "seed=0,1", "total_frames=1_000_000"))
+    assert rows["disk"].startswith("about 1.4 GB for the replay of a job")
+    assert "400 steps/s, which is assumed" in rows["time"]
 
 
 @pytest.mark.parametrize(

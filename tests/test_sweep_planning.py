@@ -11,7 +11,7 @@ from fake_runs import STEP, make, train
 from fake_runs import end as end_run
 from pgdm.config.store import _composed as composed_settings
 from pgdm.errors import ConfigError, SweepError
-from pgdm.sweep.estimate import ASSUMED_STEPS_PER_S, estimate
+from pgdm.sweep.estimate import estimate
 from pgdm.sweep.plan import FILE, Plan, SweepCfg, check_fits, job_key, read_plan, record
 from pgdm.sweep.planning import make_plan
 
@@ -185,8 +185,8 @@ def test_no_sweep_here(tmp_path: Path) -> None:
 def test_the_speed_is_assumed_where_nothing_was_measured(tmp_path: Path) -> None:
     cost = estimate(planned(("seed=0",), ("seed=1",)), tmp_path)
     assert (cost.finished, cost.begun, cost.frames_left) == (0, 0, 2 * 40960)
-    assert (cost.steps_per_s, cost.measured_runs) == (ASSUMED_STEPS_PER_S, 0)
-    assert cost.hours == pytest.approx(81920 / ASSUMED_STEPS_PER_S / 3600)
+    assert (cost.steps_per_s, cost.measured_runs) == (1_000, 0)
+    assert cost.hours == pytest.approx(81920 / 1_000 / 3600)
 
 
 def test_what_is_done_is_not_left(tmp_path: Path) -> None:

@@ -107,6 +107,8 @@ def _rows(plan: Plan, cost: Estimate) -> list[tuple[str, str]]:
         if cost.measured_runs
         else f"{speed}, which is assumed: no earlier run like these lies in {paths.runs()}"
     )
+    disk = max(cfg.total_frames * cfg.algo.usual_frame_bytes for cfg in cfgs) / 1e9
+    replay = [("disk", f"about {disk:.1f} GB for the replay of a job, until it has finished")]
     return [
         ("jobs", f"{len(cfgs)} ({', '.join(state)})"),
         ("tasks", f"{len(tasks)}: {_some(tasks)}"),
@@ -115,6 +117,7 @@ def _rows(plan: Plan, cost: Estimate) -> list[tuple[str, str]]:
         ("differ in", _some(_differing(plan))),
         ("frames", f"{lengths} a job, {total:,} in all, {cost.frames_left:,} to do"),
         ("time", f"about {_span(cost.hours)} of training, one job after the other at {source}"),
+        *(replay if disk else []),
     ]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -15,6 +15,11 @@ from pgdm.rl.vec_env import VecEnv
 @dataclass(frozen=True)
 class AlgoCfg:
     """Settings that every learner has."""
+
+    usual_steps_per_s: ClassVar[float] = 1_000.0
+    """Environment steps a second, between two idle cores and two busy ones."""
+    usual_frame_bytes: ClassVar[int] = 0
+    """What each frame takes on the disk as long as a run goes on; about."""
 
     learner: str
     """``ppo`` or ``sac``."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -24,6 +24,9 @@ if TYPE_CHECKING:  # torchrl takes 4 s to import
 @dataclass(frozen=True)
 class SACCfg(AlgoCfg):
     """Settings of soft actor-critic; ``conf/algo/sac.yaml`` has them with their reasons."""
+
+    usual_steps_per_s: ClassVar[float] = 400.0
+    usual_frame_bytes: ClassVar[int] = 1_400
 
     reward_scale: float
     """Rewards are multiplied by it before they are learned from."""

@@ -13,8 +13,6 @@ from pgdm.sweep.plan import Job, Plan
 from pgdm.sweep.state import stand
 from pgdm.tracking.run_folder import RESULT, RunFolder, find_runs, read_json
 
-ASSUMED_STEPS_PER_S = 1_000.0
-"""Where no run was measured: between two idle cores and two busy ones (README.md)."""
 _NEWEST = 50
 """So many earlier runs are asked at most."""
 
@@ -54,7 +52,7 @@ def estimate(plan: Plan, root: Path) -> Estimate:
         finished=left.count(0),
         begun=sum(bool(d and n) for d, n in zip(done, left, strict=True)),
         frames_left=sum(left),
-        steps_per_s=median(speeds) if speeds else ASSUMED_STEPS_PER_S,
+        steps_per_s=median(speeds or [job.cfg.algo.usual_steps_per_s for job in plan.jobs]),
         measured_runs=len(speeds),
     )
 
