@@ -70,6 +70,22 @@ def test_a_run_its_policy_and_the_end_of_its_replay(library_home: Path, tmp_path
     assert read_json(tmp_path / "run" / "result.json")["status"] == "finished"
 
 
+def test_a_run_that_came_to_its_time_limit_shows_what_it_has(
+    library_home: Path, tmp_path: Path
+) -> None:
+    limited = ("total_frames=1_000_000", "time_limit_min=0.02")
+    run = sac_run(*limited)
+    assert (run.code, run.errors) == (0, [])
+    assert re.search(r"time_limit_min=0.02 was reached at [\d,]+ of 1,000,000 frames", run.err)
+    frames = read_json(tmp_path / "run" / "result.json")["frames"]
+    assert frames < 1_000_000
+    assert not (tmp_path / "run" / "replay").exists()
+    again = sac_run(*limited)
+    assert (again.code, again.errors) == (0, [])
+    assert "finished already" in again.err
+    assert read_json(tmp_path / "run" / "result.json")["frames"] == frames
+
+
 def test_a_replay_that_was_kept_lets_the_run_go_on(library_home: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     assert sac_run("keep_replay=true").code == 0

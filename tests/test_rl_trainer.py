@@ -241,6 +241,33 @@ def test_a_finished_training_can_be_made_longer(tmp_path: Path) -> None:
     assert_same(weights(longer), weights(straight))
 
 
+def test_a_time_limit_ends_a_training_with_what_it_has_all_attempts_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter(range(10_000))  # each look at the clock is a second
+    monkeypatch.setattr("pgdm.rl.trainer.time.monotonic", lambda: float(next(clock)))
+    folder = CheckpointFolder(tmp_path, 2)
+
+    def trainer(limit_s: float) -> Trainer:
+        evaluation = Evaluator(lambda n: PointEnv(n, seed=1), 4, 1, seed=3)
+        extras = Extras(evaluation=evaluation, checkpoints=folder)
+        return Trainer(PointEnv(), trainer_cfg(time_limit_s=limit_s), extras)
+
+    first = trainer(20.0).run()
+    assert first.status == "finished"
+    assert 0 < first.progress.frames == first.progress.total_frames < 4096
+    state = folder.latest()
+    assert state is not None
+    assert state["frames"] == state["evaluated_at"] == first.progress.frames
+    assert first.evaluation == state["last_evaluation"]
+
+    same, longer = trainer(20.0), trainer(40.0)
+    for resumed in (same, longer):
+        resumed.load_state_dict(state)
+    assert same.run().progress.frames == first.progress.frames
+    assert longer.run().progress.frames > first.progress.frames
+
+
 def test_resuming_a_finished_training_does_nothing(tmp_path: Path) -> None:
     folder, record = CheckpointFolder(tmp_path, 2), Record()
     extras = Extras(evaluation=evaluator(), checkpoints=folder)

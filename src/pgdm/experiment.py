@@ -23,7 +23,7 @@ from pgdm.library.report import Progress as FetchProgress
 from pgdm.methods import recipe
 from pgdm.pregrasp.provide import Wanted, ensure_start
 from pgdm.rl.callback import Callback, Progress
-from pgdm.rl.checkpoint import CheckpointFolder
+from pgdm.rl.checkpoint import CheckpointFolder, State
 from pgdm.rl.evaluate import Evaluator
 from pgdm.rl.trainer import Extras, Outcome, Trainer, TrainerCfg
 from pgdm.stop import stoppable
@@ -198,8 +198,7 @@ class Run(Callback):
         """Train to the end, or until ``stop``."""
         state = self._checkpoints.latest()
         stored = read_json(self.dir / RESULT)
-        done = state is not None and int(state["frames"]) >= self.cfg.total_frames
-        if done and stored.get("status") == "finished":
+        if state is not None and self._ended(state) and stored.get("status") == "finished":
             self._notify(f"{self.dir} is finished already; its result:")
             for text in self.builder.differences(stored):
                 self._notify(f"note: it was made with {text}")
@@ -229,6 +228,12 @@ class Run(Callback):
             raise
         finally:
             self._tracker.finish(status, patience_s)
+
+    def _ended(self, state: State) -> bool:
+        """Return whether a training had come to its end, or to its limit of time."""
+        limit = self.cfg.time_limit_min
+        in_time = limit is None or state["elapsed_s"] < 60 * limit
+        return int(state["frames"]) >= self.cfg.total_frames or not in_time
 
     def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
         """Record an iteration."""
