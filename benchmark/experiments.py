@@ -74,7 +74,7 @@ EXPERIMENTS = (
     Experiment(
         "path-outside",
         "a path that leaves the base's range cannot be corrected",
-        ("action.path_within_limits=false",),
+        ("action.wrist_path=carried",),
         "bringing it inside is",
     ),
     Experiment(

@@ -19,7 +19,7 @@ FLOORS: list[set[str]] = [
     {"library"},
     {"motion"},
     {"sim"},
-    {"pregrasp"},
+    {"pregrasp", "wrist"},
     {"mdp"},
     {"envs"},
     {"methods"},

@@ -8,23 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from pgdm import rotations
 from pgdm.errors import UnknownNameError
 from pgdm.mdp import rewards, terminations
-from pgdm.mdp.actions import ActionCfg, absolute, action_map, residual, wrist_path
+from pgdm.mdp.actions import ActionCfg, absolute, action_map, residual
 from pgdm.mdp.context import StepContext
 from pgdm.mdp.metrics import Episodes, MetricsCfg, episode_metrics
 from pgdm.mdp.observations import ObsCfg, layout, released
-from pgdm.motion.reference import ObjectReference
 from pgdm.sim.batch import SimState
-from pgdm.sim.scene import SceneIndex
-
-QUARTER_Z = [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
-IDENTITY = [1.0, 0.0, 0.0, 0.0]
-
-
-def double(values: object) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
+from tiny_scene import IDENTITY, QUARTER_Z, double, reference, tiny_index
 
 
 def state(pos: list, quat: list) -> SimState:
@@ -75,10 +66,6 @@ def test_object_is_lost_at_the_limit_exactly() -> None:
 def test_motion_ends_at_its_last_pose(t: int, ended: bool) -> None:
     c = context([[0.0, 0, 0]], [IDENTITY], [[0.0, 0, 0]], [IDENTITY], t)
     assert terminations.motion_ended(c).item() is ended
-
-
-def reference(points: list, quats: list | None = None) -> ObjectReference:
-    return ObjectReference(double(points), double(quats or [IDENTITY] * len(points)))
 
 
 CFG = MetricsCfg(success_threshold_m=0.01, lift_height_m=0.02)
@@ -136,31 +123,13 @@ def test_unknown_layout_and_kind_name_the_valid_ones() -> None:
     with pytest.raises(UnknownNameError, match="released"):
         layout(ObsCfg("relesed"), tiny_index(), ref)
     with pytest.raises(UnknownNameError, match="residual"):
-        action_map(ActionCfg("residul", 3, 0.25, False), tiny_index(), ref, torch.zeros(8))
-
-
-def tiny_index() -> SceneIndex:
-    """Six base joints and two fingers; the mount is turned a quarter about z."""
-    return SceneIndex(
-        point_geoms=np.array([0]),
-        point_bodies=np.array([0]),
-        object_body=1,
-        fingertips=np.array([0]),
-        num_actuators=8,
-        num_compensated=8,
-        num_base_joints=6,
-        ctrl_low=np.array([-1.0, -1, -1, -2, -2, -2, 0, 0]),
-        ctrl_high=np.array([1.0, 1, 1, 2, 2, 2, 1, 2]),
-        mount_pos=np.array([0.0, -0.5, 0.2]),
-        mount_quat=np.array(QUARTER_Z),
-        randomized_geom=None,
-    )
+        action_map(ActionCfg("residul", 3, 0.25, "carried"), tiny_index(), ref, torch.zeros(8))
 
 
 def test_absolute_action_is_affine_and_clipped() -> None:
     ref = reference([[0.0, 0, 0]] * 3)
     amap = absolute(
-        ActionCfg("absolute", 3, 0.25, False), tiny_index(), ref, torch.zeros(8).double()
+        ActionCfg("absolute", 3, 0.25, "carried"), tiny_index(), ref, torch.zeros(8).double()
     )
     ctrl = amap.act(torch.tensor([[0.5, 0, 0, 0, 0, 0, 0.5, 9.0]]), torch.tensor([0]))[0]
     torch.testing.assert_close(ctrl, double([0.5, 0, 0, 0, 0, 0, 0.75, 2.0]))
@@ -169,34 +138,8 @@ def test_absolute_action_is_affine_and_clipped() -> None:
 def test_warm_start_adds_a_fifth_to_the_second_joint_and_the_fingers() -> None:
     ref = reference([[0.0, 0, 0]] * 3)
     start = double([0.5, 0, 0, 1.0, 0, 0, 0.5, 1.9])
-    amap = absolute(ActionCfg("absolute", 3, 0.25, False), tiny_index(), ref, start)
+    amap = absolute(ActionCfg("absolute", 3, 0.25, "carried"), tiny_index(), ref, start)
     torch.testing.assert_close(amap.warm_start, double([0.5, 0.2, 0, 0.5, 0, 0, 0.2, 1.0]))
-
-
-def test_wrist_follows_a_pure_shift() -> None:
-    # The mount is turned by 90 degrees about z: world x is its -y, world y its x.
-    ref = reference([[0.0, 0, 0], [0.1, 0.2, 0.3]])
-    path = wrist_path(tiny_index(), ref, torch.zeros(8).double())
-    torch.testing.assert_close(path[0], torch.zeros(6).double())
-    torch.testing.assert_close(path[1], double([0.2, -0.1, 0.3, 0, 0, 0]))
-
-
-def test_wrist_carries_the_hand_rigidly() -> None:
-    generator = torch.Generator().manual_seed(0)
-    quats = torch.randn(6, 4, generator=generator, dtype=torch.float64)
-    quats = torch.nn.functional.normalize(quats[:1] + 0.3 * quats, dim=-1)
-    ref = ObjectReference(torch.randn(6, 3, generator=generator, dtype=torch.float64), quats)
-    index, start = tiny_index(), double([0.1, -0.2, 0.3, 0.4, -0.5, 0.6, 0, 0])
-    path = wrist_path(index, ref, start)
-    torch.testing.assert_close(path[0], start[:6])
-    mount_quat = torch.from_numpy(index.mount_quat)
-    pos = torch.from_numpy(index.mount_pos) + rotations.rotate(mount_quat, path[:, :3])
-    quat = rotations.multiply(mount_quat, rotations.from_euler_xyz(path[:, 3:]))
-    inverse = rotations.conjugate(ref.quat)
-    seen_pos = rotations.rotate(inverse, pos - ref.pos)  # the hand, seen from the object
-    seen_quat = rotations.multiply(inverse, quat)
-    torch.testing.assert_close(seen_pos, seen_pos[:1].expand_as(seen_pos))
-    assert (rotations.angle(seen_quat, seen_quat[:1].expand_as(seen_quat)) < 1e-7).all()
 
 
 def test_a_path_out_of_range_can_be_corrected_only_if_it_is_brought_into_it() -> None:
@@ -205,14 +148,14 @@ def test_a_path_out_of_range_can_be_corrected_only_if_it_is_brought_into_it() ->
     ref = reference([[0.0, 0, 0], [0.0, 1.5, 0.0]])
     action, t = torch.tensor([[-1.0, 0, 0, 0, 0, 0, 0, 0]]), torch.tensor([1])
     start = torch.zeros(8).double()
-    for within, expected in ((False, 1.0), (True, 0.75)):
-        amap = residual(ActionCfg("residual", 3, 0.25, within), tiny_index(), ref, start)
+    for path, expected in (("carried", 1.0), ("clipped", 0.75)):
+        amap = residual(ActionCfg("residual", 3, 0.25, path), tiny_index(), ref, start)
         assert amap.act(action, t)[0, 0].item() == pytest.approx(expected)
 
 
 def test_residual_leads_by_three_steps_and_corrects_a_quarter() -> None:
     ref = reference([[0.0, 0.01 * k, 0.0] for k in range(10)])
-    cfg = ActionCfg("residual", 3, 0.25, False)
+    cfg = ActionCfg("residual", 3, 0.25, "carried")
     amap = residual(cfg, tiny_index(), ref, torch.zeros(8).double())
     action = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0, 0], [0.0] * 8])
     ctrl = amap.act(action, torch.tensor([2, 8]))

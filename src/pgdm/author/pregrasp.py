@@ -15,12 +15,12 @@ from pgdm.errors import ConfigError
 from pgdm.library import Library, Start, figures, pregrasp_file
 from pgdm.library.motion_checks import Poses
 from pgdm.library.report import Progress
-from pgdm.mdp.actions import wrist_path
 from pgdm.motion.reference import ObjectReference
 from pgdm.pregrasp.near import NearPose, poses_near
 from pgdm.pregrasp.quality import LiftTest
 from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
+from pgdm.wrist.path import carried_path
 
 CHOICES = ("mean", "open", "later")
 
@@ -133,7 +133,7 @@ def _wrist_over(scene: Scene, poses: Poses) -> Callable[[np.ndarray], np.ndarray
     slack = np.array([SLACK_M] * _SLIDES + [SLACK_RAD] * (len(low) - _SLIDES))
 
     def over(qpos: np.ndarray) -> np.ndarray:
-        path = wrist_path(scene.index, reference, torch.from_numpy(qpos)).numpy()
+        path = carried_path(scene.index, reference, torch.from_numpy(qpos)).numpy()
         return np.maximum(low - slack - path, path - high - slack)
 
     return over

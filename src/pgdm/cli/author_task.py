@@ -13,10 +13,10 @@ from pgdm.cli.pregrasp_predict import outcome
 from pgdm.cli.train import notify
 from pgdm.errors import RenderError
 from pgdm.library import Library, ensure, figures, open_library
-from pgdm.mdp.actions import wrist_path
 from pgdm.motion.reference import ObjectReference
 from pgdm.sim.replay import motion_qpos
 from pgdm.sim.sheet import Panel, write_sheet
+from pgdm.wrist.path import carried_path
 
 _PANELS = 6
 
@@ -73,7 +73,7 @@ def film_panels(made: AuthoredTask) -> list[Panel]:
     reference = ObjectReference(torch.from_numpy(poses.pos), torch.from_numpy(poses.quat))
     qpos = motion_qpos(scene, made.pregrasp.qpos, reference)
     base = scene.index.num_base_joints
-    path = wrist_path(scene.index, reference, torch.from_numpy(made.pregrasp.qpos)).numpy()
+    path = carried_path(scene.index, reference, torch.from_numpy(made.pregrasp.qpos)).numpy()
     qpos[:, :base] = path.clip(*scene.model.jnt_range[:base].T)
     moments = np.linspace(0, len(qpos) - 1, _PANELS).round().astype(int)
     return [Panel(qpos[t], f"{made.id}  {0.04 * t:.1f} s", "") for t in moments]

@@ -42,7 +42,7 @@ _BESIDE = (
 
 # Keys that came after the first runs, and the values that those runs amount to.
 ADDED_LATER: dict[str, Any] = {
-    "action.path_within_limits": False,
+    "action.wrist_path": "carried",
     "algo.learner": "ppo",
     "keep_replay": False,
     "shaping.name": "none",

@@ -22,6 +22,7 @@ from pgdm.rl.evaluate import EvalCfg
 from pgdm.rl.learner import AlgoCfg
 from pgdm.sim.scene import OBJECT_MASSES, HandCfg, SimCfg, TaskCfg
 from pgdm.tracking import TRACKERS, TrackingCfg
+from pgdm.wrist.path import PATHS
 
 
 @dataclass(frozen=True)
@@ -156,6 +157,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "pregrasp.fallback": SOURCES,
     "obs.layout": tuple(LAYOUTS),
     "action.kind": tuple(KINDS),
+    "action.wrist_path": tuple(PATHS),
     "reference.frame": FRAMES,
     "hand.gravity_compensation": ("all", "base"),
     "sim.object_mass": OBJECT_MASSES,

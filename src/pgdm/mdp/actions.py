@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pgdm import rotations
 from pgdm.errors import UnknownNameError
 from pgdm.motion.reference import ObjectReference
 from pgdm.sim.scene import SceneIndex
+from pgdm.wrist.path import PATHS
 
 Act = Callable[[Tensor, Tensor], Tensor]
 """Actions (n, nu) and steps since reset (n,) -> actuator targets (n, nu) float64, m and rad."""
@@ -31,10 +31,8 @@ class ActionCfg:
     """Residual: steps by which the wrist's target runs ahead, against the servo's lag."""
     residual_scale: float
     """Residual: largest correction as a share of half the actuator's range (0..1)."""
-    path_within_limits: bool
-    """Residual: whether the wrist's path is brought into the actuators' ranges before it is
-    corrected; otherwise no correction moves a joint whose path lies further outside than it
-    reaches."""
+    wrist_path: str
+    """Residual: ``carried``, ``clipped`` or ``feasible``; see `pgdm.wrist.path`."""
 
 
 @dataclass(frozen=True)
@@ -64,37 +62,15 @@ def absolute(
     return ActionMap(lambda a, t: a.double().clamp(-1.0, 1.0) * half + middle, warm.clamp(-1, 1))
 
 
-def wrist_path(index: SceneIndex, reference: ObjectReference, start: Tensor) -> Tensor:
-    """Return base joints (T, 6), m and rad, that carry the hand rigidly with the exemplar.
-
-    With D = R(x_k) R(x_0)^-1 the mount's body goes to x_k + D (p_0 - x_0) and turns to D R_0
-    (SPEC 7); three slides, then intrinsic X-Y-Z hinges, in the mount's frame.
-    """
-    mount_pos, mount_quat = torch.from_numpy(index.mount_pos), torch.from_numpy(index.mount_quat)
-    slides, hinges = start[:3], start[3 : index.num_base_joints]
-    p0 = mount_pos + rotations.rotate(mount_quat, slides)
-    r0 = rotations.multiply(mount_quat, rotations.from_euler_xyz(hinges))
-    turn = rotations.multiply(reference.quat, rotations.conjugate(reference.quat[0]))
-    pos = reference.pos + rotations.rotate(turn, (p0 - reference.pos[0]).expand_as(reference.pos))
-    to_mount = rotations.conjugate(mount_quat)
-    in_mount = rotations.multiply(to_mount, rotations.multiply(turn, r0))
-    angles = rotations.unwrap(rotations.to_euler_xyz(in_mount))
-    # Start on the branch of the start state itself, which may lie beyond +-pi.
-    angles = angles + 2 * torch.pi * torch.round((hinges - angles[0]) / (2 * torch.pi))
-    return torch.cat((rotations.rotate(to_mount, pos - mount_pos), angles), -1)
-
-
 def residual(
     cfg: ActionCfg, index: SceneIndex, reference: ObjectReference, start: Tensor
 ) -> ActionMap:
     """Return the map in which the exemplar motion moves the wrist and the policy corrects it."""
     base = absolute(cfg, index, reference, start)
     n = index.num_base_joints
-    path = wrist_path(index, reference, start)
+    path = PATHS[cfg.wrist_path](index, reference, start)
     low, high = torch.from_numpy(index.ctrl_low), torch.from_numpy(index.ctrl_high)
     reach = cfg.residual_scale * 0.5 * (high - low)[:n]
-    if cfg.path_within_limits:
-        path = torch.clamp(path, low[:n], high[:n])
 
     def act(a: Tensor, t: Tensor) -> Tensor:
         target = base.act(a, t)
@@ -120,8 +96,10 @@ def action_map(
     """Return the configured map for a task that starts in qpos ``start`` (nq,).
 
     Raises:
-        UnknownNameError: if there is no such kind.
+        UnknownNameError: if there is no such kind or path.
     """
+    if cfg.wrist_path not in PATHS:
+        raise UnknownNameError("action.wrist_path value", cfg.wrist_path, PATHS)
     if cfg.kind not in KINDS:
         raise UnknownNameError("action kind", cfg.kind, KINDS)
     return KINDS[cfg.kind](cfg, index, reference, start)

@@ -1,0 +1,1 @@
+"""Where the wrist should go for the object to follow its exemplar motion."""
