@@ -152,7 +152,8 @@ def one_step(
         "raw_terms": {"near": torch.full((n,), near)},
     }
     ends = torch.full((n,), terminated)
-    return Step(torch.zeros(n, D) if obs is None else obs, torch.zeros(n, A), ends, info)
+    seen = torch.zeros(n, D) if obs is None else obs
+    return Step(seen, torch.zeros(n, A), ends, torch.zeros_like(ends), info)
 
 
 def constant(learner: SACLearner, critics: list[float], targets: list[float]) -> None:
@@ -253,6 +254,25 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing() -> None:
     after = learner.state_dict()
     for part in ("model", "loss", "optimizers"):
         assert flat(after[part]) == flat(before[part])
+
+
+def test_a_step_that_was_cut_is_not_learned_from() -> None:
+    env = PointEnv()
+    learner = build(env, SHORT)
+    step = one_step(env)
+    step.truncated[2] = True
+    learner.after_step(step)
+    assert len(learner._replay) == env.num_envs - 1
+
+
+def test_what_came_after_an_end_may_be_anything() -> None:
+    env = PointEnv()
+    learner = build(env, replace(SHORT, warmup_steps=1))
+    step = one_step(env)
+    step.terminated[:] = True
+    step.info["final_obs"] = torch.full((env.num_envs, D), math.nan)
+    learner.after_step(step)
+    learner.during_step()  # raises if it is used
 
 
 def test_a_weight_that_is_not_finite_is_told_before_anything_is_saved() -> None:
@@ -367,6 +387,17 @@ def test_the_entropy_target_falls_over_the_frames_seen() -> None:
             learner.after_step(one_step(env))
         learner.during_step()
         assert float(learner._loss.target_entropy) == pytest.approx(expected * env.action_dim)
+
+
+def test_values_are_not_rounded_by_bfloat16() -> None:
+    # Spaced by 0.06 around 12 in bfloat16, they would be a handful of numbers.
+    critic = networks()[1][0]
+    with torch.no_grad():
+        critic.net[-1].bias.fill_(12.0)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            values = critic(torch.randn(256, D), torch.rand(256, A))
+    assert values.dtype == torch.float32
+    assert len(values.unique()) > 200
 
 
 def test_equals_torchrls_own_loss() -> None:

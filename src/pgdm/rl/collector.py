@@ -7,16 +7,19 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from pgdm.errors import RunError
-from pgdm.rl.vec_env import Finished, VecEnv, VecStep
+from pgdm.rl.vec_env import Finished, VecEnv
 
 if TYPE_CHECKING:
     from pgdm.rl.learner import Learner
+
+
+T = TypeVar("T")
 
 
 @contextmanager
@@ -34,6 +37,25 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+class Aside:
+    """Work that may go on in a second thread, with one thread of torch.
+
+    Args:
+        name: of the thread.
+        wanted: whether there is one; if not, work is done when its result is asked for.
+    """
+
+    def __init__(self, name: str, wanted: bool) -> None:
+        self._pool = None
+        if wanted:
+            one = {"initializer": torch.set_num_threads, "initargs": (1,)}
+            self._pool = ThreadPoolExecutor(1, name, **one)
+
+    def __call__(self, work: Callable[[], T]) -> Callable[[], T]:
+        """Start work; call what is returned for its result."""
+        return work if self._pool is None else self._pool.submit(work).result
+
+
 @dataclass(frozen=True)
 class Step:
     """One control step of N simulations."""
@@ -44,6 +66,8 @@ class Step:
     """(N, A) actions as sampled."""
     terminated: Tensor
     """(N,) bool, nothing came after."""
+    truncated: Tensor
+    """(N,) bool, the episode was cut."""
     info: dict[str, Any]
     """As the environment gave it: ``final_obs``, ``raw_terms`` and more."""
 
@@ -117,7 +141,7 @@ class Collector:
         self._rollout = Rollout.empty(steps, env)
         # The policy that acts never waits for the learner's work beside the step before: whether
         # both really happen at the same time changes nothing but the speed.
-        self._physics = ThreadPoolExecutor(1, "pgdm-physics") if learner.overlaps else None
+        self._aside = Aside("pgdm-physics", learner.overlaps)
 
     @property
     def frames(self) -> int:
@@ -157,16 +181,12 @@ class Collector:
         # A sum is finite only if all its parts are, and costs a tenth of looking at each.
         if not math.isfinite(float(reward.sum()) + float(obs.sum())):
             _check_finite(t, obs, reward, info)
-        self.learner.after_step(Step(acted_on, action, terminated, info))
+        self.learner.after_step(Step(acted_on, action, terminated, truncated, info))
         if truncated.any():
             rows = truncated.nonzero()[:, 0]
             rollout.last_obs.append((t, rows, info["final_obs"][rows].clone()))
         if info["episodes"] is not None:
             rollout.finished.append(info["episodes"])
-
-    def _aside(self, work: Callable[[], VecStep]) -> Callable[[], VecStep]:
-        """Start work in the other thread, if there is one; call the result for its result."""
-        return work if self._physics is None else self._physics.submit(work).result
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the next rollout depends on, the policy aside."""

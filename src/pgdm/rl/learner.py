@@ -80,11 +80,6 @@ class Learner(Protocol):
         ...
 
     @property
-    def evaluated(self) -> Model:
-        """The policy that is measured."""
-        ...
-
-    @property
     def overlaps(self) -> bool:
         """Whether ``during_step`` has work that may go on beside the physics of a step."""
         ...

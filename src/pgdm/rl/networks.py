@@ -199,7 +199,7 @@ class SquashedPolicy(nn.Module):
 
     def forward(self, normalized: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and deviation before the squashing, (M, A) each, at (M, D) normalised."""
-        mean, log_std = self.net(normalized).float().chunk(2, -1)
+        mean, log_std = precise_end(self.net, normalized).chunk(2, -1)
         return mean, log_std.clamp(*_LOG_STD_RANGE).exp()
 
     @torch.no_grad()
@@ -236,7 +236,17 @@ class ActionValue(nn.Module):
 
     def forward(self, normalized: Tensor, action: Tensor) -> Tensor:
         """Return the value, (M, 1)."""
-        return self.net(torch.cat((normalized, action), -1)).float()
+        return precise_end(self.net, torch.cat((normalized, action), -1))
+
+
+def precise_end(net: nn.Sequential, inputs: Tensor) -> Tensor:
+    """Return a network's outputs, the last layer in float32 also under autocast.
+
+    It costs nothing, and in bfloat16 a value of 12 is rounded to 0.06.
+    """
+    hidden = net[:-1](inputs)
+    with torch.autocast(inputs.device.type, enabled=False):
+        return net[-1](hidden.float())
 
 
 def silu_mlp(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pgdm.errors import ConfigError, RunError
-from pgdm.rl.collector import Rollout, Step, torch_threads
+from pgdm.rl.collector import Aside, Rollout, Step, torch_threads
 from pgdm.rl.learner import AlgoCfg
 from pgdm.rl.loss import PolicyLoss, Samples, advantages, policy_loss, value_loss
 from pgdm.rl.networks import ActorCritic, NetworkCfg, gaussian_log_prob
@@ -88,18 +86,9 @@ class PPOLearner:
         self._optimizer = torch.optim.Adam(
             self._params, lr=cfg.learning_rate, eps=cfg.adam_eps, fused=True
         )
-        self._helper = None
-        if num_threads > 1 and model.device.type == "cpu":
-            self._helper = ThreadPoolExecutor(
-                1, "pgdm-critic", initializer=torch.set_num_threads, initargs=(1,)
-            )
+        self._aside = Aside("pgdm-critic", num_threads > 1 and model.device.type == "cpu")
 
     overlaps = False
-
-    @property
-    def evaluated(self) -> ActorCritic:
-        """The policy that is measured."""
-        return self.model
 
     def during_step(self) -> None:
         """Do nothing: all is learned between two rollouts."""
@@ -205,10 +194,6 @@ class PPOLearner:
         error = value_loss(self.model.value(obs), target)
         (self.cfg.value_coef * error).backward()
         return error
-
-    def _aside(self, work: Callable[[], Tensor]) -> Callable[[], Tensor]:
-        """Start work in the other thread, if there is one; call the result for its result."""
-        return work if self._helper is None else self._helper.submit(work).result
 
     def _policy_metrics(self) -> dict[str, float]:
         std = float(self.model.log_std.detach().exp().mean())

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pgdm.errors import ConfigError, RunError
-from pgdm.rl.collector import Rollout, Step, torch_threads
+from pgdm.rl.collector import Rollout, Step
 from pgdm.rl.learner import AlgoCfg
 from pgdm.rl.networks import ActionValue, SquashedCfg, SquashedPolicy
 from pgdm.rl.vec_env import VecEnv
@@ -41,7 +41,7 @@ class SACCfg(AlgoCfg):
     updates_per_step: int
     """Updates of the critics per control step of all simulations."""
     actor_interval: int
-    """The policy learns in every so manieth update."""
+    """The policy is updated once every so many updates of the critics."""
     target_entropy: float
     """Entropy of the policy that the temperature steers to at first, nat per action entry."""
     target_entropy_end: float
@@ -148,11 +148,6 @@ class SACLearner:
         self._updates = 0
         self._logged: list[dict[str, Tensor]] = []
 
-    @property
-    def evaluated(self) -> SquashedPolicy:
-        """The policy that is measured."""
-        return self.model
-
     def during_step(self) -> None:
         """Take the updates of one step.
 
@@ -161,27 +156,34 @@ class SACLearner:
         """
         if len(self._replay) < self.cfg.warmup_steps * self._env.num_envs:
             return
-        with torch_threads(1):
-            for _ in range(self.cfg.updates_per_step):
-                self._update()
+        for _ in range(self.cfg.updates_per_step):
+            self._update()
 
     def after_step(self, step: Step) -> None:
-        """Append a step to the replay, and its observations to their statistics."""
+        """Append a step to the replay, and its observations to their statistics.
+
+        What a simulation that diverged came to is not known, so there is nothing to learn from.
+        """
         info, discount = step.info, step.info.get("discount")
-        self._replay.append(
-            {
-                "observation": step.obs,
-                "action": step.action,
-                "terms": torch.stack(tuple(info["raw_terms"].values()), -1),
-                "discount": torch.ones(len(step.obs)) if discount is None else discount,
-                "terminated": step.terminated,
-                "next_observation": info["final_obs"],
-            }
-        )
+        frames = {
+            "observation": step.obs,
+            "action": step.action,
+            "terms": torch.stack(tuple(info["raw_terms"].values()), -1),
+            "discount": torch.ones(len(step.obs)) if discount is None else discount,
+            "terminated": step.terminated,
+            "next_observation": info["final_obs"],
+        }
+        if step.truncated.any():
+            frames = {name: values[~step.truncated] for name, values in frames.items()}
+        self._replay.append(frames)
         self.model.normalizer.update(step.obs.to(self.model.device))
 
     def learn(self, rollout: Rollout) -> dict[str, float]:
-        """Return the means of what the iteration's updates logged."""
+        """Return the means of what the iteration's updates logged.
+
+        Raises:
+            RunError: if a weight is not finite any more.
+        """
         logged, self._logged = self._logged, []
         if not math.isfinite(sum(float(p.detach().sum()) for p in self._loss.parameters())):
             raise RunError(
@@ -267,7 +269,8 @@ class SACLearner:
         reward = self.cfg.reward_scale * (frames["terms"] @ weights.to(frames.device).float())
         ended = frames["terminated"][:, None]
         after = {
-            "observation": normalize(frames["next_observation"]),
+            # A value that is not finite would survive the multiplication that switches it off.
+            "observation": normalize(frames["next_observation"].masked_fill(ended, 0.0)),
             "reward": reward[:, None],
             "discount": frames["discount"][:, None],
             "terminated": ended,

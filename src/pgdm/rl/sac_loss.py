@@ -1,4 +1,4 @@
-"""TorchRL's soft actor-critic loss over pgdm's networks, and its randomness under control."""
+"""TorchRL's soft actor-critic loss over pgdm's networks, with a random stream of its own."""
 
 from __future__ import annotations
 
@@ -100,24 +100,24 @@ class SoftActorCriticLoss(SACLoss):
 
     def critic_loss(self, batch: TensorDict) -> Tensor:
         """Return the squared error () of all critics, summed over them."""
-        with _drawing_from(self._generator):
+        with _drawing_from(self._generator, self.log_alpha.device):
             return self.qvalue_v2_loss(batch)[0]
 
     def policy_and_temperature_loss(self, batch: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
         """Return the policy's loss (), the temperature's (), and the policy's entropy (), nat."""
-        with _drawing_from(self._generator):
+        with _drawing_from(self._generator, self.log_alpha.device):
             loss, about = self.actor_loss(batch)
         log_prob = about["log_prob"]
         return loss, self.alpha_loss(log_prob).mean(), -log_prob.mean()
 
 
 @contextmanager
-def _drawing_from(generator: torch.Generator) -> Iterator[None]:
-    """Let what draws from torch's global stream draw from this one inside."""
-    outside = torch.get_rng_state()
-    torch.set_rng_state(generator.get_state())
-    try:
+def _drawing_from(generator: torch.Generator, device: torch.device) -> Iterator[None]:
+    """Let what draws from torch's global streams draw from this one inside."""
+    cuda = device.type == "cuda"
+    with torch.random.fork_rng([device] if cuda else []):
+        if cuda:  # it has no stream that could be handed over: a seed for each loss
+            torch.cuda.manual_seed(int(torch.randint(2**62, (), generator=generator)))
+        torch.set_rng_state(generator.get_state())
         yield
-    finally:
         generator.set_state(torch.get_rng_state())
-        torch.set_rng_state(outside)

@@ -126,7 +126,7 @@ class Trainer:
     @property
     def model(self) -> Model:
         """The policy that is measured."""
-        return self._learner.evaluated
+        return self._learner.model
 
     @property
     def progress(self) -> Progress:
