@@ -5,7 +5,8 @@
     python benchmark/experiments.py --collect     write the table of what is stored
 
 Each experiment changes `+experiment=fast` and runs on the suite `tune6`, which shares no task with
-`quick6`, on which only what is kept is confirmed. Two runs train at a time, one thread each.
+`quick6`, on which only what is kept is confirmed. What was stored under settings that have changed
+since is trained anew. Two runs train at a time, one thread each.
 """
 
 from __future__ import annotations
@@ -19,7 +20,11 @@ from typing import Any
 
 from short_runs import Job, curves, finished, train_all
 
+from pgdm.config.identity import identity_hash
+from pgdm.config.saved import FILE, load_config
+from pgdm.config.store import compose
 from pgdm.config.suites import suite
+from pgdm.tracking.run_folder import RunFolder, read_json
 
 RESULTS = Path(__file__).parent / "results" / "experiments"
 TUNE6 = suite("tune6")
@@ -51,7 +56,7 @@ EXPERIMENTS = (
         "no-shaping",
         "without a slope far from the target objects are held beside their path",
         ("shaping=none",),
-        "the soft end is",
+        "yes: soft end",
     ),
     Experiment(
         "kernel",
@@ -75,7 +80,7 @@ EXPERIMENTS = (
         "path-outside",
         "a path that leaves the base's range cannot be corrected",
         ("action.wrist_path=carried",),
-        "bringing it inside is",
+        "yes: path within limits",
     ),
     Experiment(
         "cool",
@@ -90,15 +95,35 @@ EXPERIMENTS = (
 )
 
 
+def identity_of(job: Job) -> str:
+    """Return the hash of all settings that act on a run's result."""
+    return identity_hash(compose([f"task={job.task}", *job.overrides, f"seed={job.seed}"]))
+
+
+def current(job: Job) -> bool:
+    """Return whether a result is stored that was made with today's settings and length."""
+    one = read_json(RESULTS / f"{job.name}.json")
+    return one.get("identity") == identity_of(job) and one["frames"] >= FRAMES
+
+
 def collect(run: Path, job: Job) -> dict[str, Any] | None:
     """Return what a finished run reached and how, or None if it has not finished."""
     result = finished(run)
-    if result is None:
+    if result is None or identity_hash(load_config(run)) != identity_of(job):
         return None
     names = [f"{kind}/{n}" for kind in ("eval_sampled", "eval_deterministic") for n in CURVES]
-    about = {"task": job.task, "setting": job.setting, "seed": job.seed}
+    about: dict[str, Any] = {"task": job.task, "setting": job.setting, "seed": job.seed}
+    about["identity"] = identity_of(job)
     about |= {"overrides": list(job.overrides), "curves": curves(run, "eval", names)}
     return about | {key: result[key] for key in ("frames", "wall_time_s", "git", "versions")}
+
+
+def make_way(run: Path, job: Job) -> None:
+    """Rename a run's folder if it was made with other settings: no run would go on in it."""
+    if not (run / FILE).exists() or RunFolder(run).busy:
+        return
+    if (old := identity_hash(load_config(run))) != identity_of(job):
+        run.rename(run.with_name(f"{run.name}-{old}-{run.stat().st_mtime:.0f}"))
 
 
 def last(one: dict[str, Any], name: str) -> float:
@@ -150,17 +175,19 @@ def main() -> None:
         jobs = [
             Job(task, e.name, (*COMMON, *e.overrides), seed) for seed in e.seeds for task in TUNE6
         ]
-        missing = [job for job in jobs if not (RESULTS / f"{job.name}.json").exists()]
+        missing = [job for job in jobs if not current(job)]
         if not options.collect and e.name in (options.names or known):
+            for job in missing:
+                make_way(options.runs / job.name, job)
             train_all(options.runs, missing)
         for job in missing:
             one = collect(options.runs / job.name, job)
             if one is not None:
                 (RESULTS / f"{job.name}.json").write_text(json.dumps(one, indent=1) + "\n")
-        files = [RESULTS / f"{job.name}.json" for job in jobs]
-        stored[e.name] = [json.loads(file.read_text()) for file in files if file.exists()]
-        page = f"# {FRAMES:,} frames of tune6\n\n`python benchmark/experiments.py`\n\n"
-        (RESULTS / "README.md").write_text(page + table(stored))
+        stored[e.name] = [read_json(RESULTS / f"{job.name}.json") for job in jobs if current(job)]
+        if any(stored.values()):
+            page = f"# {FRAMES:,} frames of tune6\n\n`python benchmark/experiments.py`\n\n"
+            (RESULTS / "README.md").write_text(page + table(stored))
     print(table(stored))
 
 

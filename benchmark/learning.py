@@ -2,6 +2,7 @@
 
     python benchmark/learning.py                    train what is missing, then collect
     python benchmark/learning.py --frames 300000    go so far only; a later call goes on from there
+                                                    (a run that was begun for more goes on to that)
     python benchmark/learning.py --settings fast --seeds 0
     python benchmark/learning.py --collect          collect only, also of runs that still go on
 
@@ -14,14 +15,17 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 from short_runs import Job, curves, train_all
 
-from pgdm.config.saved import load_config
+from pgdm.config.saved import FILE, load_config
+from pgdm.config.store import compose
 from pgdm.config.suites import suite
+from pgdm.experiment import assets, env_builder
 from pgdm.tracking.run_folder import read_json
 from pgdm.tracking.run_log import RunLog, metrics_of
 
@@ -71,6 +75,46 @@ def collect(run: Path, job: Job) -> dict[str, Any] | None:
     }
 
 
+def stored(job: Job) -> dict[str, Any]:
+    """Return the stored result of a run; empty if there is none."""
+    return read_json(RESULTS / f"{job.name}.json")
+
+
+def store(job: Job, one: dict[str, Any]) -> None:
+    """Store the result of a run, unless one of more frames is stored."""
+    if one["frames"] >= stored(job).get("frames", 0):
+        (RESULTS / f"{job.name}.json").write_text(json.dumps(one, indent=1) + "\n")
+
+
+def to_train(runs: Path, job: Job, frames: int) -> Job | None:
+    """Return a run with its length, or None if its stored result is of so many frames."""
+    if stored(job).get("frames", 0) >= frames:
+        return None
+    run = runs / job.name
+    begun = load_config(run).total_frames if (run / FILE).exists() else 0
+    # The length of a run may only grow.
+    return replace(job, overrides=(*job.overrides, f"total_frames={max(frames, begun)}"))
+
+
+def scene_now(task: str) -> str:
+    """Return the hash of a task's scene as it is compiled today."""
+    cfg = compose([f"task={task}"])
+    return str(env_builder(cfg, assets(cfg, print)).facts()["scene_sha256"])
+
+
+def with_old_scenes(found: list[dict[str, Any]], scenes: dict[str, str]) -> list[dict[str, Any]]:
+    """Return results with ``old_scene``, whether the scene has changed since.
+
+    Args:
+        found: the results; of those that do not tell their scene nothing is known.
+        scenes: hash of each task's scene today.
+    """
+    return [
+        r | {"old_scene": r.get("scene_sha256", scenes[r["task"]]) != scenes[r["task"]]}
+        for r in found
+    ]
+
+
 def at(one: dict[str, Any], name: str, frames: int) -> float | None:
     """Return a metric of a run at its evaluation next after so many frames, or None."""
     for when, value in zip(one["curve_frames"], one["curves"][name], strict=True):
@@ -89,12 +133,12 @@ def table(found: list[dict[str, Any]]) -> str:
     )
     rows = []
     for r in found:
-        m = r["metrics"]
+        m, task = r["metrics"], f"{r['task']} (old scene)" if r["old_scene"] else r["task"]
         early = [at(r, f"{kind}/success", EARLY) for kind in KINDS]
         shown = [*early, *(m[f"{kind}/success"] for kind in KINDS), m.get("eval_sampled/lifted")]
         cells = ["-" if value is None else f"{value:.1%}" for value in shown]
         rows.append(
-            f"| {r['task']} | {r['setting']} | {r['seed']} | {' | '.join(cells[:2])} "
+            f"| {task} | {r['setting']} | {r['seed']} | {' | '.join(cells[:2])} "
             f"| {r['frames']:,} | {r['wall_time_s'] / 60:.0f} | {' | '.join(cells[2:])} "
             f"| {m['eval_sampled/com_error_released']:.2e} | {r['paper_success']:.1%} "
             f"| {r['paper_com_error']:.2e} |\n"
@@ -103,7 +147,10 @@ def table(found: list[dict[str, Any]]) -> str:
 
 
 def means(found: list[dict[str, Any]]) -> str:
-    """Return each setting's mean over tasks and seeds, of the runs that have come so far."""
+    """Return each setting's mean over tasks and seeds, of the runs that have come so far.
+
+    What was made in a scene that has changed since is left out.
+    """
     lines = []
     for setting in SETTINGS:
         for frames in (EARLY, FRAMES):
@@ -111,6 +158,7 @@ def means(found: list[dict[str, Any]]) -> str:
                 value
                 for r in found
                 if r["setting"] == setting
+                and not r["old_scene"]
                 and (value := at(r, "eval_sampled/success", frames)) is not None
             ]
             if values:
@@ -118,6 +166,22 @@ def means(found: list[dict[str, Any]]) -> str:
                     f"- {setting}: sampled success {sum(values) / len(values):.1%} at {frames:,} "
                     f"frames, mean of {len(values)} runs\n"
                 )
+    return "".join(lines)
+
+
+def remarks(found: list[dict[str, Any]]) -> str:
+    """Return what is to be known of the table and the picture."""
+    lines = []
+    if any(r["old_scene"] for r in found):
+        lines.append(
+            "Old scene: made before the task's scene was corrected, and in no mean; trained anew "
+            "once the stored file is removed.\n\n"
+        )
+    if untimed := sum("curve_minutes" not in r for r in found):
+        lines.append(
+            f"{untimed} of the runs were stored without times; the curves over minutes lack "
+            "them.\n\n"
+        )
     return "".join(lines)
 
 
@@ -160,7 +224,6 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, help="of those each setting has")
     parser.add_argument("--collect", action="store_true", help="do not train")
     options = parser.parse_args()
-    length = f"total_frames={options.frames}"
     every = [
         Job(task, setting, (*COMMON, *SETTINGS[setting]), seed)
         for setting in SETTINGS
@@ -168,11 +231,12 @@ def main() -> None:
         for task in QUICK6
     ]
     wanted = [
-        Job(job.task, job.setting, (*job.overrides, length), job.seed)
+        longer
         for job in every
         if job.setting in options.settings
         and job.task in options.tasks
         and job.seed in (options.seeds or [job.seed])
+        and (longer := to_train(options.runs, job, options.frames)) is not None
     ]
     if not options.collect:
         train_all(options.runs, wanted)
@@ -180,12 +244,12 @@ def main() -> None:
     for job in every:
         one = collect(options.runs / job.name, job)
         if one is not None:
-            (RESULTS / f"{job.name}.json").write_text(json.dumps(one, indent=1) + "\n")
-    stored = [RESULTS / f"{job.name}.json" for job in every]
-    found = [json.loads(file.read_text()) for file in stored if file.exists()]
+            store(job, one)
+    scenes = {task: scene_now(task) for task in QUICK6}
+    found = with_old_scenes([one for job in every if (one := stored(job))], scenes)
     (RESULTS / "README.md").write_text(
         f"# {len(found)} of {len(every)} runs\n\n`python benchmark/learning.py`\n\n"
-        f"{means(found)}\n{table(found)}"
+        f"{means(found)}\n{remarks(found)}{table(found)}"
     )
     plot(found, RESULTS / "curves.png")
     print(means(found), table(found), sep="\n")

@@ -167,7 +167,12 @@ def test_broken_settings_of_your_own(tmp_path: Path) -> None:
         broken = command("pgdm-run", "--config-dir", "mine", "algo=a")
         assert_helps(broken, "not valid YAML", "a.yaml", code=2)
         lacking = command("pgdm-run", "--config-dir", "mine", "algo=b")
-        assert_helps(lacking, "missing algo.name, algo.gae_lambda", code=2)
+        assert_helps(lacking, "missing algo.learner; one of ppo, sac", code=2)
+    named = Path("mine", "experiment", "fast.yaml")
+    (tmp_path / named).parent.mkdir()
+    (tmp_path / named).write_text("seed: 7\n")
+    clash = command("pgdm-run", "--config-dir", "mine", "+experiment=fast")
+    assert_helps(clash, f"{named} has the name of pgdm's", code=2)
 
 
 # Run folders.

@@ -10,6 +10,7 @@ import pytest
 
 from command_line import TINY, TINY_SAC, Outcome, command
 from pgdm.config.store import compose
+from pgdm.errors import CheckpointError
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
 from pgdm.tracking.run_folder import read_json
@@ -35,6 +36,10 @@ def test_a_dry_run_says_how_large_the_replay_is(library_home: Path, tmp_path: Pa
     said = " ".join((outcome.out + outcome.err).split())
     assert f"the replay takes {1_000_016 * frame / 1e9:.2f} GB of disk" in said
     assert "removed when the run has finished" in said
+    assert "+experiment=fast" not in said
+    papers = sac_run("total_frames=50_000_000", "budget=paper", "--dry-run")
+    length = compose(["+experiment=fast"]).total_frames
+    assert f"+experiment=fast trains for {length:,} frames" in " ".join(papers.out.split())
     kept = sac_run("total_frames=1000001", "keep_replay=true", "--dry-run")
     assert "it is kept" in " ".join((kept.out + kept.err).split())
     ppo = command("pgdm-run", "--offline", *TINY, "--dry-run")
@@ -77,8 +82,11 @@ def test_a_run_that_came_to_its_time_limit_shows_what_it_has(
     run = sac_run(*limited)
     assert (run.code, run.errors) == (0, [])
     assert re.search(r"time_limit_min=0.02 was reached at [\d,]+ of 1,000,000 frames", run.err)
-    frames = read_json(tmp_path / "run" / "result.json")["frames"]
-    assert frames < 1_000_000
+    result = read_json(tmp_path / "run" / "result.json")
+    frames = result["frames"]
+    assert frames < result["total_frames"] == 1_000_000
+    assert (result["status"], result["ended_by"]) == ("finished", "time_limit")
+    assert result["wall_time_s"] >= 1.2
     assert not (tmp_path / "run" / "replay").exists()
     again = sac_run(*limited)
     assert (again.code, again.errors) == (0, [])
@@ -132,3 +140,26 @@ def test_a_replay_that_was_lost_halfway_is_told(library_home: Path, tmp_path: Pa
     shutil.rmtree(folder / "replay")
     gone = sac_run("keep_replay=true", "total_frames=96")
     assert "is gone" in gone.errors[0]
+    assert not (folder / "replay").exists()
+
+
+def test_a_start_that_is_refused_leaves_the_replay_as_it_was(
+    library_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    assert sac_run("keep_replay=true").code == 0
+    before = {path: path.stat().st_size for path in (folder / "replay").iterdir()}
+
+    def refuse(*_: object) -> None:
+        raise CheckpointError("the checkpoint is of another network")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("pgdm.rl.trainer.Trainer.load_state_dict", refuse)
+        assert sac_run("keep_replay=true", "total_frames=64").errors
+        assert {path: path.stat().st_size for path in (folder / "replay").iterdir()} == before
+        shutil.rmtree(folder / "replay")
+        assert sac_run("total_frames=64").errors
+    assert not (folder / "replay").exists()
+    monkeypatch.setattr("pgdm.experiment.check_assets", refuse)
+    monkeypatch.setattr("pgdm.experiment.Run._make_trainer", lambda *_: pytest.fail("too early"))
+    assert "another network" in sac_run("total_frames=64").errors[0]

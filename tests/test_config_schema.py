@@ -124,6 +124,7 @@ def test_every_field_says_what_it_means() -> None:
         node = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == cls.__name__)
         for field, after in zip(node.body, [*node.body[1:], None], strict=True):
             is_field = isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+            is_field = is_field and "ClassVar" not in ast.unparse(field.annotation)
             said = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
             if is_field and not said:
                 undocumented.append(f"{cls.__name__}.{ast.unparse(field.target)}")

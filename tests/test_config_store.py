@@ -60,7 +60,7 @@ def test_every_named_experiment_composes_and_can_be_changed(name: str) -> None:
         (["budget=reduced"], 1_000_000, "reduced"),
         (["budget=smoke"], 8192, "smoke"),
         (["budget=smoke", "total_frames=100_000_000"], 100_000_000, "smoke"),
-        (["+experiment=quickstart"], 524_288, "reduced"),
+        (["+experiment=quickstart"], 300_000, "reduced"),
         (["+experiment=quickstart", "budget=smoke"], 8192, "smoke"),
         (["+experiment=quickstart", "budget=paper"], 50_000_000, "paper"),
     ],
@@ -77,11 +77,11 @@ def test_a_budget_changes_nothing_of_what_is_computed() -> None:
     assert len(hashes) == 1
 
 
-def test_quickstart_is_residual_and_fast() -> None:
+def test_quickstart_has_the_recommended_settings() -> None:
     cfg = compose(["+experiment=quickstart"])
-    assert (cfg.action.kind, cfg.algo.name, cfg.num_envs) == ("residual", "ppo_fast", 64)
-    assert cfg.total_frames % (cfg.num_envs * cfg.algo.steps_per_env) == 0
-    assert cfg.budget == "reduced"
+    assert (cfg.action.kind, cfg.algo.name, cfg.num_envs) == ("residual", "sac", 64)
+    assert (cfg.budget, cfg.time_limit_min) == ("reduced", 10)
+    assert identity_hash(cfg) == identity_hash(compose(["+experiment=fast", "task=hammer-use1"]))
 
 
 def test_ppo_fast_changes_only_what_it_says() -> None:
@@ -155,6 +155,41 @@ def test_wrong_settings_are_answered_on_one_line(override: str, message: str) ->
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["algo.clip=0.1"], "'algo.clip' is a setting of algo=ppo or ppo_fast only"),
+        (["algo.updates_per_stp=2"], "did you mean algo.updates_per_step or"),
+    ],
+)
+def test_messages_know_the_learner_that_an_experiment_chose(
+    overrides: list[str], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        compose(["+experiment=fast", *overrides])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["~algo.learner"], "missing algo.learner; one of ppo, sac"),
+        (["~method.name"], "missing method.name; one of pgdm, deepmimic, graff"),
+        (["algo.learner=null"], "algo.learner: null is not allowed here; it must be text"),
+        (
+            ["algo.learner=sac"],
+            "algo.gae_lambda belongs to algo.learner=ppo, not to sac; .*: algo=sac$",
+        ),
+        (
+            ["method=graff", "method.name=pgdm"],
+            "method.contact belongs to method.name=graff or full, not to pgdm; .*: method=pgdm$",
+        ),
+    ],
+)
+def test_settings_of_several_learners_or_methods(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        compose(overrides)
+
+
 @settings(deadline=None, max_examples=30)
 @given(st.text(st.characters(codec="ascii"), max_size=12), st.text(max_size=8))
 def test_any_text_is_a_setting_or_refused(key: str, value: str) -> None:
@@ -177,6 +212,23 @@ def test_your_own_settings_folder(tmp_path: Path) -> None:
     assert "mine" in available("task", own)
     with pytest.raises(UnknownNameError, match="unknown task 'mine'"):
         compose(["task=mine"])
+
+
+@pytest.mark.parametrize("name", ["experiment/fast", "suite/quick6", "task/_tcdm"])
+def test_a_file_of_your_own_with_the_name_of_one_of_pgdms(tmp_path: Path, name: str) -> None:
+    file = tmp_path / f"{name}.yaml"
+    file.parent.mkdir()
+    file.write_text("seed: 7\n")
+    with pytest.raises(ConfigError, match="give yours another name") as caught:
+        compose(config_dir=tmp_path)
+    assert str(file) in str(caught.value)
+    assert str(conf_dir() / f"{name}.yaml") in str(caught.value)
+    file.rename(file.with_name("mine.yaml"))
+    compose(config_dir=tmp_path)
+
+
+def test_pgdms_own_folder_may_be_named(tmp_path: Path) -> None:
+    assert compose(config_dir=conf_dir()) == compose()
 
 
 def test_an_edited_file_is_read_anew(tmp_path: Path) -> None:

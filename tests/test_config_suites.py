@@ -14,7 +14,7 @@ from pgdm.errors import ConfigError, UnknownNameError
 TASKS = available("task")
 SIZES = {
     "tcdm50": 50, "tcdm30": 30, "adroit40": 40, "dhand": 5, "dmanus": 2, "adroit_experts": 36,
-    "quick6": 6, "animated7": 7,
+    "quick6": 6, "tune6": 6, "animated7": 7,
 }  # fmt: skip
 
 

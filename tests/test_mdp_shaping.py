@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+from command_line import TINY, command
 from pgdm.config.store import compose
 from pgdm.errors import ConfigError
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
 from pgdm.mdp.shaping import SLOPE, ShapingCfg
+from pgdm.tracking.run_folder import read_json
 
 SETTINGS = ("task=hammer-use1", "shaping=soft_end", "shaping.soft_end_m=0.1")
 KERNEL = ("shaping.kernel_weight=5", "shaping.kernel_scale=10")
@@ -49,9 +52,30 @@ def test_without_shaping_a_training_is_as_an_evaluation() -> None:
 
 def test_what_is_added_is_said() -> None:
     assert STILL.described() == ""
-    told = replace(STILL, name="mine", kernel_weight=5.0, soft_end_m=0.15).described()
-    assert told.startswith("shaping=mine: in trainings only")
-    assert "5 exp(-10 e)" in told and "exp(-(e/0.15)^2)" in told
+    told = replace(STILL, kernel_weight=5.0, soft_end_m=0.15).described()
+    assert told == (
+        "with the object at distance e from its target, 5 exp(-e/0.1 m) is added to the reward and "
+        "future rewards are scaled by exp(-(e/0.15 m)^2)"
+    )
+
+
+def test_a_dry_run_has_rows_for_what_is_added(library_home: Path) -> None:
+    outcome = command("pgdm-run", "--offline", *SETTINGS, *KERNEL, "--dry-run")
+    rows = [line.split() for line in outcome.out.splitlines()]
+    assert ["reward,", "training", "only", "slope", "5"] in rows
+    assert ["discount,", "training", "only"] in rows
+    plain = command("pgdm-run", "--offline", "task=hammer-use1", "--dry-run")
+    assert "training only" not in plain.out
+
+
+@pytest.mark.usefixtures("library_home")
+def test_a_result_says_what_was_added_and_nothing_if_nothing_was(tmp_path: Path) -> None:
+    for name, settings in (("bare", ()), ("shaped", KERNEL)):
+        outcome = command("pgdm-run", "--offline", *TINY, *settings, f"run_dir={name}")
+        assert outcome.code == 0, outcome.err
+    assert "shaping" not in read_json(tmp_path / "bare" / "result.json")
+    told = read_json(tmp_path / "shaped" / "result.json")["shaping"]
+    assert told.endswith("5 exp(-e/0.1 m) is added to the reward")
 
 
 @pytest.mark.parametrize(

@@ -70,3 +70,9 @@ def test_labels_leave_out_what_is_shared_and_it_is_said_once() -> None:
     assert found[two].startswith("pgdm, pregrasp=none")
     short = setting("algo=ppo_fast", "action=residual", "total_frames=4096")
     assert list(labels([one, short]).values()) == ["pgdm, 50,000,000 frames", "pgdm, 4,096 frames"]
+
+
+def test_runs_that_the_time_ended_are_not_averaged_with_whole_ones() -> None:
+    config = compose_plain(["task=cup-pour1", "time_limit_min=10"])
+    assert setting_of(config) == setting("task=cup-pour1")  # it had all its frames
+    assert setting_of(config, out_of_time=True).changes == ("time_limit_min=10",)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from pgdm.config.identity import with_added_keys
 from pgdm.config.store import compose
 
 BENCHMARK = Path(__file__).resolve().parents[1] / "benchmark"
@@ -24,7 +25,7 @@ def test_stored_runs_of_the_study_are_what_their_folder_says(setting: str) -> No
     tasks, overrides = study.SETTINGS[setting]
     for task in tasks:
         folder = study.place(setting, task)
-        stored = yaml.safe_load((folder / "config.yaml").read_text())
+        stored = with_added_keys(yaml.safe_load((folder / "config.yaml").read_text()))
         wanted = dataclasses.asdict(compose([f"task={task}", *study.COMMON, *overrides]))
         assert stored["run_dir"] == f"runs/{setting}/{task}"
         assert stored["task"]["id"] == task

@@ -176,3 +176,14 @@ def test_somebody_else_works_in_a_run_folder(folder: Path) -> None:
         assert ledger.attempts() == []
     process.communicate(timeout=120)
     assert process.returncode == 0
+
+
+def test_a_job_that_its_limit_of_time_ends_is_finished_at_its_first_attempt(folder: Path) -> None:
+    whole = plan(folder, 1, "total_frames=1_000_000", "time_limit_min=0.02")
+    ledger = planned(whole)
+    process = start(folder)
+    _, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    [row] = rows(ledger)
+    assert (row.state, row.attempts) == ("finished", 1)
+    assert row.frames < 1_000_000

@@ -51,6 +51,16 @@ def test_how_a_run_stands(tmp_path: Path) -> None:
     assert stand(run, 64).state == "interrupted"  # it was a shorter run
 
 
+def test_a_run_that_its_limit_of_time_ended_is_finished(tmp_path: Path) -> None:
+    result(tmp_path, "finished", 16, ended_by="time_limit", wall_time_s=61.0)
+    assert stand(tmp_path, 32).state == "finished"  # under the limit that it had
+    assert stand(tmp_path, 32, 1.0).state == "finished"
+    for limit_min in (2.0, None):  # it may go on now
+        assert stand(tmp_path, 32, limit_min).state == "interrupted"
+    result(tmp_path, "finished", 16, ended_by="frames", wall_time_s=61.0)
+    assert stand(tmp_path, 32, 1.0).state == "interrupted"  # it was a shorter run
+
+
 def test_running_is_believed_only_of_the_living(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path)
     ledger.add(plan(tmp_path, 4))

@@ -32,6 +32,7 @@ exist, or a value of the wrong type, is an error before anything starts.
 
 Settings of your own go into a folder with the same layout: with `--config-dir my`, the file
 `my/experiment/ours.yaml` is `+experiment=ours`, and `my/task/mine.yaml` is `task=mine`.
+A group and name that pgdm's own files have is an error.
 """
 
 

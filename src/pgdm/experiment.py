@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -21,6 +22,7 @@ from pgdm.library import Library, ensure, ensure_expert
 from pgdm.library.provide import Spoken
 from pgdm.library.report import Progress as FetchProgress
 from pgdm.methods import recipe
+from pgdm.paths import restoring
 from pgdm.pregrasp.provide import Wanted, ensure_start
 from pgdm.rl.callback import Callback, Progress
 from pgdm.rl.checkpoint import CheckpointFolder, State
@@ -29,7 +31,15 @@ from pgdm.rl.trainer import Extras, Outcome, Trainer, TrainerCfg
 from pgdm.stop import stoppable
 from pgdm.tracking import RunFolder, open_tracker
 from pgdm.tracking.provenance import git_revision, versions
-from pgdm.tracking.run_folder import RESULT, claimed, read_json, write_json
+from pgdm.tracking.run_folder import (
+    ENDED_BY,
+    RESULT,
+    TIME_LIMIT,
+    claimed,
+    is_whole,
+    read_json,
+    write_json,
+)
 from pgdm.tracking.run_log import RunLog, metrics_of
 from pgdm.tracking.tracker import Tracker
 
@@ -108,18 +118,25 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
 def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
     """Return sentences on what in a run is not as one might think."""
     late = builder.mdp.recipe.unfinished(cfg.total_frames)
-    disk = cfg.algo.disk_bytes(builder.make(1, 1), cfg.num_envs, cfg.total_frames)
-    kept = "it is kept" if cfg.keep_replay else "removed when the run has finished"
     return [
         *builder.notes,
-        *([told] if (told := cfg.shaping.described()) else []),
-        *([f"the replay takes {disk / 1e9:.2f} GB of disk; {kept}"] if disk else []),
+        *([f"in trainings only, {told}"] if (told := cfg.shaping.described()) else []),
+        *(_of_replay(cfg, builder) if cfg.algo.usual_frame_bytes else []),
         *(
             f"the weight of '{name}' only comes to {last:.3g} of {weight:g} in "
             f"{cfg.total_frames:,} frames: its schedule is longer than the run"
             for name, last, weight in late
         ),
     ]
+
+
+def _of_replay(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
+    disk = cfg.algo.disk_bytes(builder.make(1, 1), cfg.num_envs, cfg.total_frames)
+    kept = "it is kept" if cfg.keep_replay else "removed when the run has finished"
+    note = f"the replay takes {disk / 1e9:.2f} GB of disk; {kept}"
+    if cfg.budget == "paper":
+        note += f" ({cfg.total_frames:,} frames; +experiment=fast trains for 300,000 frames)"
+    return [note]
 
 
 def threads(cfg: ExperimentCfg) -> int:
@@ -190,7 +207,8 @@ class Run(Callback):
         self.cfg, self.builder, self.dir, self._notify = cfg, builder, run_dir, notify
         self._log = RunLog(run_dir / "metrics.jsonl")
         self._checkpoints = CheckpointFolder(run_dir / "checkpoints", cfg.checkpoint.keep_last)
-        self._facts = {**builder.facts(), "shaping": cfg.shaping.name, "git": git_revision()}
+        shaping = {"shaping": told} if (told := cfg.shaping.described()) else {}
+        self._facts = {**builder.facts(), **shaping, "git": git_revision()}
         self._tracker: Tracker | None = None
         self._trainer: Trainer | None = None
 
@@ -198,18 +216,20 @@ class Run(Callback):
         """Train to the end, or until ``stop``."""
         state = self._checkpoints.latest()
         stored = read_json(self.dir / RESULT)
-        if state is not None and self._ended(state) and stored.get("status") == "finished":
+        if state is not None and self._ended(state, stored):
             self._notify(f"{self.dir} is finished already; its result:")
             for text in self.builder.differences(stored):
                 self._notify(f"note: it was made with {text}")
             return self._stored_result(stored)
         for note in notes(self.cfg, self.builder):
             self._notify(note)
-        trainer = self._make_trainer((self, *callbacks), stop)
         if state is not None:
             check_assets(state["metadata"], self.builder, self.dir, self._notify)
-            trainer.load_state_dict(state)
-            self._notify(f"continuing {self.dir} at {state['frames']:,} frames")
+        with restoring(self.dir / REPLAY):  # a start that is refused leaves no reserved room
+            trainer = self._make_trainer((self, *callbacks), stop)
+            if state is not None:
+                trainer.load_state_dict(state)
+                self._notify(f"continuing {self.dir} at {state['frames']:,} frames")
         save_config(self.cfg, self.dir)
         self._log.truncate(trainer.progress.frames if state is not None else -1)
         (self.dir / RESULT).unlink(missing_ok=True)  # it tells of an earlier end, not of this one
@@ -229,11 +249,10 @@ class Run(Callback):
         finally:
             self._tracker.finish(status, patience_s)
 
-    def _ended(self, state: State) -> bool:
-        """Return whether a training had come to its end, or to its limit of time."""
-        limit = self.cfg.time_limit_min
-        in_time = limit is None or state["elapsed_s"] < 60 * limit
-        return int(state["frames"]) >= self.cfg.total_frames or not in_time
+    def _ended(self, state: State, stored: dict[str, Any]) -> bool:
+        """Return whether a run had come to its end, and its last checkpoint is still there."""
+        whole = is_whole(stored, self.cfg.total_frames, self.cfg.time_limit_min)
+        return whole and int(state["frames"]) >= stored["frames"]
 
     def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
         """Record an iteration."""
@@ -319,15 +338,18 @@ class Run(Callback):
             float(r["train/steps_per_s"]) for r in self._log.read() if "train/steps_per_s" in r
         ]
         video = self._video(progress)
+        ended_by = TIME_LIMIT if progress.frames < self.cfg.total_frames else "frames"
         write_json(
             self.dir / RESULT,
             {
                 "status": status,
+                **({ENDED_BY: ended_by} if status == "finished" else {}),
                 "task": self.cfg.task.id,
                 "budget": self.cfg.budget,
                 "frames": progress.frames,
-                "total_frames": progress.total_frames,
-                "wall_time_s": round(progress.elapsed_s, 1),
+                "total_frames": self.cfg.total_frames,
+                # Rounded up: never below the limit of time that ended the run.
+                "wall_time_s": math.ceil(10 * progress.elapsed_s) / 10,
                 # Of collecting and learning; wall_time_s has evaluations and films too.
                 "steps_per_s": round(harmonic_mean(rates), 1) if rates else 0.0,
                 "metrics": {k: v for k, v in metrics.items() if v == v},

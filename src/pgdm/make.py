@@ -39,7 +39,8 @@ def make_batch(
         seed: for tasks that vary per reset.
         auto_reset: whether finished rows restart by themselves.
         offline: whether missing assets are an error instead of being fetched.
-        overrides: more settings, as on ``pgdm-run``'s command line.
+        overrides: more settings, as on ``pgdm-run``'s command line. The env is one to train in:
+            with a shaping (``["+experiment=fast"]`` has one) its rewards include what that adds.
         choices: an option of a group by name: ``pregrasp="planned"``, ``obs="released"``,
             ``action="absolute"``, ``method="pgdm"``, ``ablation="none"``.
 

@@ -74,6 +74,26 @@ def replacing(path: Path) -> Iterator[Path]:
             temp.unlink()
 
 
+@contextlib.contextmanager
+def restoring(folder: Path) -> Iterator[None]:
+    """Take back what was made in a folder, the folder too, if what follows fails.
+
+    Files that were there before and have grown get their old length back.
+    """
+    before = {path: path.stat() for path in folder.glob("*")}
+    try:
+        yield
+    except BaseException:
+        for path in folder.glob("*"):
+            if path not in before:
+                path.unlink()
+            elif path.stat().st_ino == before[path].st_ino:  # else another has taken its place
+                os.truncate(path, before[path].st_size)
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+        raise
+
+
 def _sync(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:

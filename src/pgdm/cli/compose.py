@@ -44,11 +44,13 @@ def compose_all(flags: Flags) -> Composed:
     from hydra.types import RunMode
     from omegaconf import OmegaConf
 
+    from pgdm.config.groups import check_own
     from pgdm.config.store import COMPOSITION_ERRORS, check_overrides, conf_dir, explain
 
     if flags.config_dir is not None and not Path(flags.config_dir).is_dir():
         raise ConfigError(f"--config-dir '{flags.config_dir}' is not a folder")
     check_overrides(flags.overrides)
+    check_own(flags.config_dir)
     for override in flags.overrides:
         key, _, value = override.partition("=")
         if key == "hydra/sweeper" and value != "pgdm":

@@ -108,7 +108,8 @@ def _rows(plan: Plan, cost: Estimate) -> list[tuple[str, str]]:
         else f"{speed}, which is assumed: no earlier run like these lies in {paths.runs()}"
     )
     disk = max(cfg.total_frames * cfg.algo.usual_frame_bytes for cfg in cfgs) / 1e9
-    replay = [("disk", f"about {disk:.1f} GB for the replay of a job, until it has finished")]
+    kept = "kept" if any(cfg.keep_replay for cfg in cfgs) else "until it has finished"
+    replay = [("disk", f"about {disk:.1f} GB for the replay of a job, {kept}")]
     return [
         ("jobs", f"{len(cfgs)} ({', '.join(state)})"),
         ("tasks", f"{len(tasks)}: {_some(tasks)}"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 
 from pgdm.config.schema import ExperimentCfg
+from pgdm.mdp.shaping import shaped
 from pgdm.methods import recipe
 
 RECORDED_AS = """\
@@ -19,7 +20,7 @@ def term_table(cfg: ExperimentCfg) -> Table:
     table = Table(box=None)
     for head in ("kind", "name", "weight"):
         table.add_column(head, no_wrap=True)
-    for row in recipe(cfg.method).table():
+    for row in shaped(recipe(cfg.method), cfg.shaping).table():
         table.add_row(*row)
     return table
 

@@ -41,6 +41,29 @@ def own_folders(config_dir: str | Path | None) -> list[Path]:
     return lasting if config_dir is None else [Path(config_dir), *lasting]
 
 
+def check_own(config_dir: str | Path | None) -> None:
+    """Refuse the user's files that have the group and name of one of pgdm's.
+
+    Hydra finds pgdm's first, and would take it without a word.
+
+    Raises:
+        ConfigError: at the first one; names both files.
+    """
+    ours = conf_dir()
+    # The sweep files lie beside conf/.
+    files = {file.relative_to(ours): file for file in ours.glob("*/**/*.yaml")}
+    sweeps = ours.parent / "sweeps"
+    files |= {file.relative_to(ours.parent): file for file in sweeps.glob("*.yaml")}
+    for folder in own_folders(config_dir):
+        for name, file in files.items():
+            own = folder / name
+            if own.is_file() and not own.samefile(file):
+                raise ConfigError(
+                    f"{own} has the name of pgdm's {file}, which would be used in its place; "
+                    "give yours another name"
+                )
+
+
 def groups(config_dir: str | Path | None = None) -> list[str]:
     """Return the names of the config groups, such as ``task``."""
     names = {

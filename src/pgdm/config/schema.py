@@ -12,11 +12,11 @@ from pgdm.library import expert_file, figures
 from pgdm.mdp.actions import KINDS, ActionCfg
 from pgdm.mdp.observations import LAYOUTS, ObsCfg
 from pgdm.mdp.shaping import ShapingCfg
-from pgdm.methods import MethodCfg, config_class, recipe
+from pgdm.methods import METHODS, MethodCfg, config_class, recipe
 from pgdm.motion.reference import FRAMES, ReferenceCfg
 from pgdm.pregrasp.ablate import AblationCfg
 from pgdm.pregrasp.sources import SOURCES, PregraspCfg
-from pgdm.rl.algos import algo_class
+from pgdm.rl.algos import ALGOS, algo_class
 from pgdm.rl.checkpoint import CheckpointCfg
 from pgdm.rl.evaluate import EvalCfg
 from pgdm.rl.learner import AlgoCfg
@@ -35,7 +35,7 @@ class ExperimentCfg:
     """The hand that moves it."""
     pregrasp: PregraspCfg
     """Where an episode starts."""
-    method: Annotated[MethodCfg, ChosenBy("name", config_class)]
+    method: Annotated[MethodCfg, ChosenBy("name", config_class, tuple(METHODS))]
     """Rewards, ends and metrics."""
     ablation: AblationCfg
     """What is taken away."""
@@ -47,7 +47,7 @@ class ExperimentCfg:
     """What trainings add to reward and ends; evaluations never see it."""
     reference: ReferenceCfg
     """How the stored motion becomes targets."""
-    algo: Annotated[AlgoCfg, ChosenBy("learner", algo_class)]
+    algo: Annotated[AlgoCfg, ChosenBy("learner", algo_class, tuple(ALGOS))]
     """How the policy learns."""
     sim: SimCfg
     """Solver settings."""

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import YAMLError
 
-from pgdm.config.groups import available, conf_dir, folders, groups, own_folders
+from pgdm.config.groups import available, check_own, conf_dir, folders, groups, own_folders
 from pgdm.config.strict import build, flatten
 from pgdm.config.suites import suite, suites
 from pgdm.errors import ConfigError, UnknownNameError
@@ -93,10 +93,11 @@ def compose(
 
     Args:
         overrides: as on the command line, such as ``["task=cup-pour1", "seed=3"]``.
-        config_dir: a folder of your own settings, searched before pgdm's.
+        config_dir: a folder of your own settings, searched after pgdm's.
 
     Raises:
-        ConfigError: if a key, an option or a value is wrong.
+        ConfigError: if a key, an option or a value is wrong, or a file of yours has the name of
+            one of pgdm's.
     """
     folder = None if config_dir is None else str(Path(config_dir).expanduser().absolute())
     if folder is not None and not Path(folder).is_dir():
@@ -127,6 +128,7 @@ def _typed(overrides: tuple[str, ...], folder: str | None, _stamp: int) -> Exper
 
 def _composed(overrides: Sequence[str], folder: str | None = None) -> DictConfig:
     check_overrides(overrides)
+    check_own(folder)
     search = search_path(own_folders(folder))
     try:
         with _LOCK, _own_hydra(), hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
@@ -254,9 +256,10 @@ def _explain_task(name: str, tasks: Sequence[str], config_dir: str | None) -> Co
 def _known_names(overrides: Sequence[str], config_dir: str | None) -> list[str]:
     """Return all keys of the experiment with the options that were chosen, dotted, and all groups.
 
-    Only of groups whose options have different keys.
+    Only of groups whose options have different keys, which named experiments may choose too.
     """
     options = [f"{group}={name}" for group in _DIFFERING for name in available(group, config_dir)]
+    options += [f"+experiment={name}" for name in available("experiment", config_dir)]
     chosen = [override for override in overrides if override in options]
     return sorted({*_keys(chosen, config_dir), *groups(config_dir)})
 

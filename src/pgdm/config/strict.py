@@ -26,11 +26,28 @@ class ChosenBy:
     """The key, whose value is text."""
     find: Callable[[str], type]
     """From its value to the class, a subclass of the one written down; raises ConfigError."""
+    names: tuple[str, ...]
+    """Values there are, for the messages; ``find`` may take others too."""
 
-    def of(self, base: type, data: object) -> type:
-        """Return the class for some data, the base where they do not say it."""
-        name = data.get(self.key) if isinstance(data, Mapping) else None
-        return self.find(name) if isinstance(name, str) else base
+    def of(self, data: Mapping[str, object], path: str) -> type:
+        """Return the class for some data.
+
+        Raises:
+            ConfigError: if they do not say it, or have keys of another class.
+        """
+        where = _join(path, self.key)
+        if self.key not in data:
+            raise ConfigError(f"missing {where}; one of {', '.join(self.names)}")
+        name = str(_value(str, data[self.key], where))
+        cls = self.find(name)
+        for key in data:
+            others = [other for other in self.names if key in _hints(self.find(other))]
+            if name in self.names and others and key not in _hints(cls):
+                raise ConfigError(
+                    f"{_join(path, key)} belongs to {where}={' or '.join(others)}, not to {name}; "
+                    f"choose all settings together: {path}={name}"
+                )
+        return cls
 
 
 @cache
@@ -70,7 +87,7 @@ def _value(hint: Any, value: object, path: str) -> Any:
     origin = typing.get_origin(hint)
     if origin is typing.Annotated:
         base, chosen = typing.get_args(hint)
-        return _value(chosen.of(base, value), value, path)
+        return _value(chosen.of(value, path) if isinstance(value, Mapping) else base, value, path)
     if origin in (types.UnionType, typing.Union):
         inner = [option for option in typing.get_args(hint) if option is not type(None)]
         return None if value is None else _value(inner[0], value, path)

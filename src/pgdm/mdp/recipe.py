@@ -13,6 +13,7 @@ from pgdm.mdp.metrics import MetricsCfg
 
 _NEVER = 10**15
 """Frames by which any schedule has come to its end."""
+_TRAINING_ONLY = ", training only"
 
 
 @dataclass(frozen=True)
@@ -106,9 +107,15 @@ class Recipe:
         """Return what is active as rows (kind, name, weight), for people to read."""
         first = self._scheduled(0)
         rows = [
-            ("reward", term.name, _weight(term.weight, first.get(term.name)))
+            (
+                f"reward{_TRAINING_ONLY if term.shaping else ''}",
+                term.name,
+                _weight(term.weight, first.get(term.name)),
+            )
             for term in self.rewards
         ]
+        if self.discount is not None:
+            rows.append((f"discount{_TRAINING_ONLY}", "", ""))
         rows += [("end", end.name, "") for end in self.ends]
         return rows + [("measure", measure.name, "") for measure in self.measures]
 

@@ -36,11 +36,12 @@ class ShapingCfg:
         """Return what it does in a sentence, or nothing."""
         parts = []
         if self.kernel_weight:
-            parts.append(f"{self.kernel_weight:g} exp(-{self.kernel_scale:g} e) is paid besides")
+            width_m = 1 / self.kernel_scale
+            parts.append(f"{self.kernel_weight:g} exp(-e/{width_m:.3g} m) is added to the reward")
         if self.soft_end_m is not None:
-            parts.append(f"the future counts for exp(-(e/{self.soft_end_m:g})^2) of itself")
-        what = f"in trainings only, with the object e metres off: {', '.join(parts)}"
-        return f"shaping={self.name}: {what}" if parts else ""
+            parts.append(f"future rewards are scaled by exp(-(e/{self.soft_end_m:g} m)^2)")
+        what = " and ".join(parts)
+        return f"with the object at distance e from its target, {what}" if parts else ""
 
     def validate(self) -> None:
         """Check the numbers.

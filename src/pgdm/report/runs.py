@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgdm.report.settings import Setting, setting_of
-from pgdm.tracking.run_folder import RunFolder
+from pgdm.tracking.run_folder import ENDED_BY, TIME_LIMIT, RunFolder
 from pgdm.tracking.run_log import Record, metrics_of
 
 SUCCESS = "eval_sampled/success"
@@ -126,7 +126,7 @@ def _run(folder: RunFolder, **known: Any) -> Run:
     facts = facts if isinstance(facts, dict) else {}
     return Run(
         path=folder.path,
-        setting=setting_of(config),
+        setting=setting_of(config, folder.result.get(ENDED_BY) == TIME_LIMIT),
         task=str(facts.get("id", "?")),
         seed=int(config.get("seed", 0)),
         budget=str(config.get("budget", "?")),

@@ -84,8 +84,14 @@ class Setting:
         return [*fewer, *(c for c in self.changes if c.split("=")[0] not in groups)]
 
 
-def setting_of(config: Mapping[str, Any]) -> Setting:
-    """Return the setting of a run's configuration."""
+def setting_of(config: Mapping[str, Any], out_of_time: bool = False) -> Setting:
+    """Return the setting of a run's configuration.
+
+    Args:
+        config: as plain containers.
+        out_of_time: whether its limit of time ended it; it is then a setting like others, so that
+            the run is not averaged with those that had all their frames.
+    """
     flat = {
         key: value
         for key, value in flatten(config).items()
@@ -106,6 +112,8 @@ def setting_of(config: Mapping[str, Any]) -> Setting:
         for key, value in flat.items()
         if key not in names and not _equal(value, base.get(key))
     ]
+    if out_of_time:
+        rest.append(f"time_limit_min={_text(config.get('time_limit_min'))}")
     total = config.get("total_frames")
     frames = total if isinstance(total, int) else 0
     return Setting(tuple(chosen.items()), (*options, *rest), frames)

@@ -132,8 +132,9 @@ class Driver:
 
     def _first_state(self, entry: Entry) -> str:
         """Return whether a job is finished or waits; the folder decides, not the ledger."""
-        done = stand(entry.run_dir, entry.total_frames).state == FINISHED
-        known = entry.state == FINISHED or (done and _holds(self._jobs[entry.key]))
+        job = self._jobs[entry.key]
+        done = _stand(job).state == FINISHED
+        known = entry.state == FINISHED or (done and _holds(job))
         return FINISHED if done and known else WAITING
 
     def _loop(self, stop: StopRequest) -> None:
@@ -192,7 +193,7 @@ class Driver:
     def _refused(self, tasks: Sequence[Task], error: SweepError) -> None:
         """Note that workers could not be started; what is at work meanwhile is a reason to wait."""
         for task in tasks:
-            found = stand(Path(task.job.cfg.run_dir), task.job.cfg.total_frames)
+            found = _stand(task.job)
             self._ledger.end(*task.id, replace(found, state=FAILED, error=str(error)))
         self._ledger.set_states({task.job.key: WAITING for task in tasks})
         if not self._workers:
@@ -227,7 +228,7 @@ class Driver:
     def _ending(self, worker: _Worker, ended: Ended) -> Ending:
         """Return how an attempt ended, by what run folder, exit code and log tell."""
         code, job = ended.code, worker.task.job
-        found = stand(Path(job.cfg.run_dir), job.cfg.total_frames)
+        found = _stand(job)
         if found.state == FINISHED and _holds(job):
             state, error = FINISHED, None
         elif ended.error is not None:
@@ -264,14 +265,18 @@ def recall(ledger: Ledger, plan: Plan) -> None:
         job, folder = jobs.get(entry.key), RunFolder(entry.run_dir)
         if job is None or entry.last is not None or folder.busy or not _holds(job):
             continue
-        ending = stand(entry.run_dir, entry.total_frames)
+        ending = _stand(job)
         ledger.recall(entry.key, folder.started(), folder.modified(), ending)
         ledger.set_states({entry.key: ending.state})
 
 
+def _stand(job: Job) -> Ending:
+    return stand(Path(job.cfg.run_dir), job.cfg.total_frames, job.cfg.time_limit_min)
+
+
 def _frames(job: Job) -> int:
     """Return how far a job is, environment steps."""
-    return stand(Path(job.cfg.run_dir), job.cfg.total_frames).frames or 0
+    return _stand(job).frames or 0
 
 
 def _holds(job: Job) -> bool:

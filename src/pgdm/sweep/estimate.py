@@ -61,7 +61,7 @@ def _frames_done(job: Job) -> int:
     """Return how far a job is; at most its last frame but one as long as it has not ended well."""
     total = job.cfg.total_frames
     try:
-        found = stand(Path(job.cfg.run_dir), total)
+        found = stand(Path(job.cfg.run_dir), total, job.cfg.time_limit_min)
     except RunError:  # starting it will tell
         return 0
     return total if found.state == FINISHED else min(found.frames or 0, total - 1)

@@ -25,7 +25,7 @@ from pgdm.sweep.ledger import (
 )
 from pgdm.sweep.processes import Process
 from pgdm.sweep.queue import UNKNOWN, Queue
-from pgdm.tracking.run_folder import RunFolder
+from pgdm.tracking.run_folder import RunFolder, is_whole
 from pgdm.tracking.run_log import Record, metrics_of
 
 SUCCESS = "eval_sampled/success"
@@ -76,8 +76,14 @@ class Summary:
     """Time until all is done, if it goes on as it does; None if that cannot be told."""
 
 
-def stand(run_dir: Path, total_frames: int) -> Ending:
-    """Return how far a run is by what its folder tells; what was killed counts as interrupted."""
+def stand(run_dir: Path, total_frames: int, time_limit_min: float | None = 0.0) -> Ending:
+    """Return how far a run is by what its folder tells; what was killed counts as interrupted.
+
+    Args:
+        run_dir: its folder.
+        total_frames: length that is asked for now.
+        time_limit_min: limit that is asked for now, None for no limit; 0: the one that it had.
+    """
     folder = RunFolder(run_dir)
     result = folder.result
     frames, metrics = result.get("frames"), result.get("metrics")
@@ -85,7 +91,7 @@ def stand(run_dir: Path, total_frames: int) -> Ending:
         lines = folder.log.tail()
         frames, metrics = (int(lines[-1]["frames"]) if lines else 0), _evaluation(lines)
     status = result.get("status", INTERRUPTED)
-    if status == FINISHED and frames < total_frames:
+    if status == FINISHED and not is_whole(result, total_frames, time_limit_min):
         status = INTERRUPTED  # the end of a shorter run
     state = status if status in (FINISHED, FAILED) else INTERRUPTED
     return Ending(state, None, frames, metrics, result.get("error"))

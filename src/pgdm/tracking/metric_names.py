@@ -49,7 +49,12 @@ METRICS = (
     Metric("diverged", "both", "0..1", "share of episodes that ended in a diverged simulation"),
     Metric("<name>_std", "eval", "as <name>", "standard deviation over the sampled episodes"),
     Metric("episodes", "train", "episodes", "episodes that ended in the iteration"),
-    Metric("reward", "train", "reward", "mean reward of a step"),
+    Metric(
+        "reward",
+        "train",
+        "reward",
+        "mean reward of a step, with what the shaping adds (`return` is without it)",
+    ),
     Metric("weight/<name>", "train", "-", "weight of a reward term that has a schedule"),
     Metric("steps_per_s", "train", "1/s", "environment steps a second, learning included"),
     Metric("loss_policy", "train", "-", "loss of the policy: PPO's clipped one, SAC's own"),

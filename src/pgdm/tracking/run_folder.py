@@ -26,6 +26,8 @@ PARENT = "parent"
 ARTIFACTS = "mlflow-artifacts"
 """Folder beside ``mlflow.db`` with MLflow's copies of files."""
 STATUSES = ("running", "finished", "interrupted", "failed")
+ENDED_BY, TIME_LIMIT = "ended_by", "time_limit"
+"""Key in ``result.json`` of a finished run, and its value if the time ended it; else ``frames``."""
 LOCK = ".lock"
 """Held by the process that works in the folder."""
 SILENT_S = 600.0
@@ -182,6 +184,23 @@ class RunFolder:
         files = plain + [(file, "videos") for file in videos]
         files += [(file, "checkpoints") for file in [checkpoints / "best.ckpt", *newest]]
         return [(file, place) for file, place in files if file.is_file()]
+
+
+def is_whole(
+    result: Mapping[str, Any], total_frames: int, time_limit_min: float | None = 0.0
+) -> bool:
+    """Return whether a run is finished, and has nothing left to do of what is asked for now.
+
+    Args:
+        result: what its ``result.json`` says.
+        total_frames: length that is asked for.
+        time_limit_min: limit that is asked for, None for no limit; 0: the one that it had.
+    """
+    if result.get("status") != "finished":
+        return False
+    limited = result.get(ENDED_BY) == TIME_LIMIT and time_limit_min is not None
+    in_time = not limited or result.get("wall_time_s", 0.0) < 60 * (time_limit_min or 0.0)
+    return result.get("frames", 0) >= total_frames or not in_time
 
 
 @contextlib.contextmanager

@@ -1,0 +1,104 @@
+"""When stored results of trainings are kept, trained anew, or left out of means."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pgdm.config.saved import save_config
+from pgdm.config.store import compose
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmark"))
+import experiments
+import learning
+from short_runs import Job
+
+JOB = Job("door-open", "fast", ("+experiment=fast",), 0)
+
+
+def result(task: str, success: float, frames: int = 1_000_000, **more: Any) -> dict[str, Any]:
+    curves = {"eval_sampled/success": [success], "eval_deterministic/success": [success]}
+    return {
+        "task": task,
+        "setting": "fast",
+        "seed": 0,
+        "curve_frames": [frames],
+        "curves": curves,
+        "frames": frames,
+        "wall_time_s": 60.0,
+        "metrics": {name: values[0] for name, values in curves.items()}
+        | {"eval_sampled/com_error_released": 1e-3},
+        "paper_success": 0.9,
+        "paper_com_error": 1e-3,
+        **more,
+    }
+
+
+def test_a_result_of_fewer_frames_replaces_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learning, "RESULTS", tmp_path)
+    for frames, kept in ((300_000, 300_000), (1_000_000, 1_000_000), (300_000, 1_000_000)):
+        learning.store(JOB, result("door-open", 0.5, frames))
+        assert learning.stored(JOB)["frames"] == kept
+
+
+def test_what_is_stored_is_not_trained_again_and_no_run_is_asked_to_shrink(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learning, "RESULTS", tmp_path)
+    asked = learning.to_train(tmp_path, JOB, 300_000)
+    assert asked is not None and asked.overrides[-1] == "total_frames=300000"
+    save_config(compose(["+experiment=fast", "total_frames=1_000_000"]), tmp_path / JOB.name)
+    asked = learning.to_train(tmp_path, JOB, 300_000)
+    assert asked is not None and asked.overrides[-1] == "total_frames=1000000"
+    learning.store(JOB, result("door-open", 0.5, 300_032))
+    assert learning.to_train(tmp_path, JOB, 300_000) is None
+    assert learning.to_train(tmp_path, JOB, 1_000_000) is not None
+
+
+def test_old_scenes_are_marked_and_in_no_mean_and_missing_times_are_told() -> None:
+    found = learning.with_old_scenes(
+        [
+            result("door-open", 0.1, scene_sha256="before"),
+            result("cup-pour1", 0.5, scene_sha256="cup", curve_minutes=[1.0]),
+            result("cup-pour1", 0.7),  # nobody knows
+        ],
+        {"door-open": "door", "cup-pour1": "cup"},
+    )
+    assert "60.0% at 1,000,000 frames, mean of 2 runs" in learning.means(found)
+    assert learning.table(found).count("(old scene)") == 1
+    assert "| door-open (old scene) |" in learning.table(found)
+    assert "2 of the runs were stored without times" in learning.remarks(found)
+    assert learning.remarks(found[1:2]) == ""
+
+
+def test_an_experiment_is_trained_anew_when_its_settings_have_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(experiments, "RESULTS", tmp_path)
+    assert not experiments.current(JOB)
+    one = {"identity": experiments.identity_of(JOB), "frames": experiments.FRAMES}
+    (tmp_path / f"{JOB.name}.json").write_text(json.dumps(one))
+    assert experiments.current(JOB)
+    changed = Job(JOB.task, JOB.setting, (*JOB.overrides, "algo.gamma=0.9"), JOB.seed)
+    assert changed.name == JOB.name and not experiments.current(changed)
+
+    run = tmp_path / "runs" / JOB.name
+    save_config(compose(["task=door-open", *JOB.overrides]), run)
+    experiments.make_way(run, JOB)
+    assert run.exists()
+    experiments.make_way(run, changed)
+    assert not run.exists() and len(list(run.parent.iterdir())) == 1
+
+
+def test_nothing_is_written_of_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(experiments, "RESULTS", tmp_path)
+    monkeypatch.setattr(sys, "argv", ["experiments.py", "--collect", "--runs", str(tmp_path / "r")])
+    monkeypatch.setattr(experiments, "EXPERIMENTS", experiments.EXPERIMENTS[:1])
+    experiments.main()
+    assert list(tmp_path.iterdir()) == []
