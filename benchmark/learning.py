@@ -7,8 +7,9 @@
     python benchmark/learning.py --collect          collect only, also of runs that still go on
 
 Four settings, each the same for all tasks: `+experiment=fast`, the same with the carried path
-clipped into the base's range, `algo=ppo_fast action=residual`, and the paper's PPO on its actions. Each run is an ordinary `pgdm-run`, so that stopping
-and starting again goes on where it was. Two runs train at a time, one thread each.
+clipped into the base's range, `algo=ppo_fast action=residual`, and the paper's PPO on its actions.
+Each run is an ordinary `pgdm-run`, so that stopping and starting again goes on where it was. Two
+runs train at a time, one thread each.
 """
 
 from __future__ import annotations
