@@ -6,8 +6,8 @@
     python benchmark/learning.py --settings fast --seeds 0
     python benchmark/learning.py --collect          collect only, also of runs that still go on
 
-Four settings, each the same for all tasks: `+experiment=fast`, the same with the carried path
-clipped into the base's range, `algo=ppo_fast action=residual`, and the paper's PPO on its actions.
+Four settings, each the same for all tasks: `+experiment=fast`, the same with a feasible
+wrist path, `algo=ppo_fast action=residual`, and the paper's PPO on its actions.
 Each run is an ordinary `pgdm-run`, so that stopping and starting again goes on where it was. Two
 runs train at a time, one thread each.
 """
@@ -38,11 +38,15 @@ EARLY = 300_000
 QUICK6 = suite("quick6")
 SETTINGS = {
     "fast": ("+experiment=fast", "eval.interval_frames=50000"),
-    "fast-clipped": ("+experiment=fast", "action.wrist_path=clipped", "eval.interval_frames=50000"),
+    "fast-feasible": (
+        "+experiment=fast",
+        "action.wrist_path=feasible",
+        "eval.interval_frames=50000",
+    ),
     "ppo_fast-residual": ("algo=ppo_fast", "action=residual", "eval.interval_frames=100000"),
     "ppo-absolute": ("algo=ppo", "action=absolute", "eval.interval_frames=100000"),
 }
-SEEDS = {"fast": (0, 1, 2), "fast-clipped": (0,), "ppo_fast-residual": (0,), "ppo-absolute": (0,)}
+SEEDS = {"fast": (0, 1, 2), "fast-feasible": (0,), "ppo_fast-residual": (0,), "ppo-absolute": (0,)}
 COMMON = ("eval.video_every_eval=false", "keep_replay=true")
 CURVES = ("success", "lifted", "return", "com_error")
 KINDS = ("eval_sampled", "eval_deterministic")
