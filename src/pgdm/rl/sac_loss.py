@@ -43,7 +43,8 @@ class DiscountedTD0(TD0Estimator):
 class SoftActorCriticLoss(SACLoss):
     """`SACLoss` whose two halves are asked for one at a time, drawing from a stream of its own.
 
-    The critics are evaluated one after the other, not under vmap; benchmark/throughput.py times both.
+    The critics are evaluated one after the other, not under vmap: benchmark/throughput.py times
+    both.
 
     Args:
         policy: the actor.
