@@ -161,16 +161,18 @@ def means(found: list[dict[str, Any]]) -> str:
     for setting in SETTINGS:
         for frames in (EARLY, FRAMES):
             values = [
-                value
+                (r["task"], value)
                 for r in found
                 if r["setting"] == setting
                 and not r["old_scene"]
                 and (value := at(r, "eval_sampled/success", frames)) is not None
             ]
             if values:
+                mean = sum(value for _, value in values) / len(values)
+                tasks = sorted({task for task, _ in values})
                 lines.append(
-                    f"- {setting}: sampled success {sum(values) / len(values):.1%} at {frames:,} "
-                    f"frames, mean of {len(values)} runs\n"
+                    f"- {setting}: sampled success {mean:.1%} at {frames:,} frames, mean of "
+                    f"{len(values)} runs, tasks: {', '.join(tasks)}\n"
                 )
     return "".join(lines)
 
@@ -213,8 +215,11 @@ def plot(found: list[dict[str, Any]], path: Path) -> None:
             axis.set_xlabel(along.removeprefix("curve_"))
             axis.set_xlim(0, FRAMES if along == "curve_frames" else None)
             axis.set_ylim(0, 1.02)
-    if axes[0][0].has_data():
-        axes[0][0].legend(fontsize=8)
+    handles = {line.get_label(): line for axis in axes[0] for line in axis.get_lines()}
+    shown = [name for name in SETTINGS if name in handles]
+    if shown:
+        # The door is not lifted: its last panel is free.
+        axes[-1][-1].legend([handles[name] for name in shown], shown, fontsize=8, loc="center")
     figure.suptitle("sampled policy, one line a seed (the paper's figures are after 50,000,000)")
     figure.tight_layout()
     figure.savefig(path, dpi=80)

@@ -116,7 +116,7 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
 
 
 def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
-    """Return sentences on what in a run is not as one might think."""
+    """Return warnings where a run deviates from its configuration, and the disk it takes."""
     late = builder.mdp.recipe.unfinished(cfg.total_frames)
     return [
         *builder.notes,
