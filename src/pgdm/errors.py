@@ -47,6 +47,10 @@ class CorruptAssetError(LibraryError):
     """An asset file is damaged or holds values that cannot be right; names file and reason."""
 
 
+class PlanMissingError(LibraryError):
+    """A wrist plan is not made yet, where it may not be made."""
+
+
 class UnsafePickleError(CorruptAssetError):
     """A pickled object asks for more than arrays, dicts, lists, strings and numbers."""
 

@@ -17,7 +17,7 @@ from pgdm.config.saved import check_run_dir, save_config
 from pgdm.config.schema import ExperimentCfg
 from pgdm.envs.build import EnvBuilder, EnvCfg
 from pgdm.envs.film import film_policy
-from pgdm.errors import PgdmError, RenderError, RunError
+from pgdm.errors import PgdmError, PlanMissingError, RenderError, RunError
 from pgdm.library import Library, ensure, ensure_expert
 from pgdm.library.provide import Spoken
 from pgdm.library.report import Progress as FetchProgress
@@ -42,6 +42,8 @@ from pgdm.tracking.run_folder import (
 )
 from pgdm.tracking.run_log import RunLog, metrics_of
 from pgdm.tracking.tracker import Tracker
+from pgdm.wrist import stored as wrist_plans
+from pgdm.wrist.stored import WristPlans
 
 _log = logging.getLogger(__name__)
 
@@ -69,13 +71,29 @@ class RunResult:
     """Where episodes started: the configured source, or its fallback."""
 
 
-def env_builder(cfg: ExperimentCfg, library: Library) -> EnvBuilder:
-    """Compile the task of an experiment."""
+def env_builder(
+    cfg: ExperimentCfg,
+    library: Library,
+    notify: Notify = _log.warning,
+    progress: FetchProgress | None = None,
+) -> EnvBuilder:
+    """Compile the task of an experiment; plans its wrist if that is wanted and not done yet.
+
+    Raises:
+        PgdmError: see `EnvBuilder` and `WristPlans`.
+    """
+    return _env_builder(cfg, library, notify, progress or Spoken(notify))
+
+
+def _env_builder(
+    cfg: ExperimentCfg, library: Library, notify: Notify, progress: FetchProgress | None
+) -> EnvBuilder:
     start = cfg.pregrasp, cfg.ablation
+    plans = WristPlans(library.root, Path(cfg.run_dir), notify, progress, threads(cfg))
     env = EnvCfg(
         cfg.task, cfg.hand, cfg.sim, *start, cfg.obs, cfg.action, cfg.reference, cfg.shaping
     )
-    return EnvBuilder(library, env, recipe(cfg.method))
+    return EnvBuilder(library, env, recipe(cfg.method), plans)
 
 
 def assets(cfg: ExperimentCfg, notify: Notify, progress: FetchProgress | None = None) -> Library:
@@ -112,7 +130,10 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
     start = wanted_start(cfg, library)
     if start.can_be_made and not start.path.is_file():
         return [f"the start '{cfg.pregrasp.source}' of '{task}' is made first"]
-    return notes(cfg, env_builder(cfg, library))
+    try:
+        return notes(cfg, _env_builder(cfg, library, _log.warning, progress=None))
+    except PlanMissingError as missing:
+        return [str(missing)]
 
 
 def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
@@ -163,9 +184,10 @@ def run_experiment(
     """
     run_dir = Path(cfg.run_dir)
     check_run_dir(cfg)
-    library = assets(cfg, notify, stoppable(stop, Spoken(notify)))
+    progress = stoppable(stop, Spoken(notify))
+    library = assets(cfg, notify, progress)
     with claimed(run_dir):
-        builder = env_builder(cfg, library)
+        builder = env_builder(cfg, library, notify, progress)
         return Run(cfg, builder, run_dir, notify).train(callbacks, stop)
 
 
@@ -231,6 +253,8 @@ class Run(Callback):
                 trainer.load_state_dict(state)
                 self._notify(f"continuing {self.dir} at {state['frames']:,} frames")
         save_config(self.cfg, self.dir)
+        if (plan := self.builder.wrist) is not None:
+            wrist_plans.write(self.dir / wrist_plans.FILE, plan, self.builder.wrist_problem)
         self._log.truncate(trainer.progress.frames if state is not None else -1)
         (self.dir / RESULT).unlink(missing_ok=True)  # it tells of an earlier end, not of this one
         self._trainer = trainer

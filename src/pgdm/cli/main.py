@@ -135,6 +135,9 @@ def view(
     reach: Annotated[
         bool, typer.Option("--reach", help="Play the plan that brings the hand to its pre-grasp.")
     ] = False,
+    wrist: Annotated[
+        bool, typer.Option("--wrist", help="Play the planned wrist: the hand alone, no object.")
+    ] = False,
     ablations: Annotated[
         bool, typer.Option("--ablations", help="Show the start under each ablation instead.")
     ] = False,
@@ -145,19 +148,21 @@ def view(
 ) -> None:
     """Replay a task's exemplar motion with the hand at its pre-grasp, or as a person moved it."""
     from pgdm.cli.ablations import view_ablations
-    from pgdm.cli.view import view_expert, view_reach, view_task
+    from pgdm.cli.view import view_expert, view_reach, view_task, view_wrist
 
     if (ablations or image is not None) and (video is not None or expert or not ablations):
         raise ConfigError(
             "--ablations and --image FILE go together, without --video, --reach and --expert"
         )
-    if reach and (ablations or expert):
-        raise ConfigError("--reach goes without --ablations and --expert")
+    if reach + wrist + ablations + expert > 1:
+        raise ConfigError("--reach, --wrist, --ablations and --expert exclude each other")
     if expert and (pregrasp is not None or hand is not None):
         raise ConfigError("--expert shows the hand as it moved: leave --pregrasp and --hand out")
     start = pregrasp or "planned"
     if ablations:
         return view_ablations(task, hand, image, start, offline)
+    if wrist:
+        return view_wrist(task, hand, video, start, offline)
     if reach:
         return view_reach(task, hand, video, start, offline)
     if expert:

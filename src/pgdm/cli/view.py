@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pgdm.cli.pregrasp_scenes import composed
 from pgdm.cli.train import notify
-from pgdm.envs.film import film_expert, film_motion, film_reach
+from pgdm.envs.film import film_expert, film_motion, film_reach, film_wrist
 from pgdm.errors import ConfigError
 from pgdm.experiment import assets, env_builder
 from pgdm.library import ensure_expert
@@ -60,6 +60,33 @@ def view_reach(
         show_motion(scene.model, qpos)
         return
     _say(video, film_reach(builder.make(1, 1), qpos, video))
+
+
+def view_wrist(
+    task: str, hand: str | None, video: Path | None, pregrasp: str, offline: bool
+) -> None:
+    """Play what the hand alone does with the planned commands of its wrist; print how near it is.
+
+    Raises:
+        PgdmError: if the task is unknown, its assets are missing, the hand's base cannot follow a
+            plan, or nothing can be drawn.
+    """
+    _check(video)
+    planned = "+experiment=fast", f"pregrasp={pregrasp}", f"offline={str(offline).lower()}"
+    cfg = composed(task, hand, *planned)
+    builder = env_builder(cfg, assets(cfg, notify), notify)
+    plan = builder.wrist
+    assert plan is not None  # the experiment wants one
+    print(
+        f"the hand alone is {1e3 * plan.error_m.mean():.1f} mm off the exemplar on average, "
+        f"{1e3 * plan.error_m.max():.0f} mm at most, within 1 cm in {plan.bound:.0%} of the steps"
+    )
+    if video is None:
+        from pgdm.sim.viewer import show_motion
+
+        show_motion(builder.scene.model, plan.qpos)
+        return
+    _say(video, film_wrist(builder.make(1, 1), plan, video))
 
 
 def view_expert(task: str, video: Path | None, offline: bool) -> None:

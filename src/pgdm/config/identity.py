@@ -43,6 +43,7 @@ _BESIDE = (
 # Keys that came after the first runs, and the values that those runs amount to.
 ADDED_LATER: dict[str, Any] = {
     "action.wrist_path": "carried",
+    "action.hold_steps": 0,
     "algo.learner": "ppo",
     "keep_replay": False,
     "shaping.name": "none",

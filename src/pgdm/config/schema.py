@@ -9,7 +9,7 @@ from typing import Annotated
 from pgdm.config.strict import ChosenBy, flatten
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.library import expert_file, figures
-from pgdm.mdp.actions import KINDS, ActionCfg
+from pgdm.mdp.actions import KINDS, WRIST_PATHS, ActionCfg
 from pgdm.mdp.observations import LAYOUTS, ObsCfg
 from pgdm.mdp.shaping import ShapingCfg
 from pgdm.methods import METHODS, MethodCfg, config_class, recipe
@@ -22,7 +22,6 @@ from pgdm.rl.evaluate import EvalCfg
 from pgdm.rl.learner import AlgoCfg
 from pgdm.sim.scene import OBJECT_MASSES, HandCfg, SimCfg, TaskCfg
 from pgdm.tracking import TRACKERS, TrackingCfg
-from pgdm.wrist.path import PATHS
 
 
 @dataclass(frozen=True)
@@ -157,7 +156,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "pregrasp.fallback": SOURCES,
     "obs.layout": tuple(LAYOUTS),
     "action.kind": tuple(KINDS),
-    "action.wrist_path": tuple(PATHS),
+    "action.wrist_path": WRIST_PATHS,
     "reference.frame": FRAMES,
     "hand.gravity_compensation": ("all", "base"),
     "sim.object_mass": OBJECT_MASSES,
@@ -174,6 +173,7 @@ _AT_LEAST: dict[str, int] = {
     "hand.num_base_joints": 0,
     "hand.num_wrist_joints": 0,
     "action.lead_steps": 0,
+    "action.hold_steps": 0,
     "action.residual_scale": 0,
     "algo.value_coef": 0,
     "algo.entropy_coef": 0,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from pgdm.envs.batch_env import BatchEnv, Mdp
 from pgdm.errors import UnknownNameError
 from pgdm.library import Expert, Library
 from pgdm.library.published_masses import RATIOS
-from pgdm.mdp.actions import ActionCfg, action_map
+from pgdm.mdp.actions import ActionCfg, action_map, warm_targets
 from pgdm.mdp.observations import ObsCfg, layout
 from pgdm.mdp.recipe import Recipe
 from pgdm.mdp.shaping import ShapingCfg, shaped
@@ -24,6 +24,7 @@ from pgdm.pregrasp.sources import PregraspCfg, start_state
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.randomize import Randomizer
 from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
+from pgdm.wrist.plan import WristPlan, WristProblem
 
 TRAIN = "train"
 """Stream of the simulations that a policy is trained in."""
@@ -53,12 +54,24 @@ class EnvCfg:
 class EnvBuilder:
     """Compiles a task once and makes batches of it.
 
+    Args:
+        library: with the task's assets.
+        cfg: what the environment is made of.
+        recipe: the method's.
+        plan: gives the plan of the wrist, where the action wants one.
+
     Raises:
         PgdmError: if the library lacks an asset, the scene does not compile, the start state is
             not stored, or the recipe needs an expert that the task does not have.
     """
 
-    def __init__(self, library: Library, cfg: EnvCfg, recipe: Recipe) -> None:
+    def __init__(
+        self,
+        library: Library,
+        cfg: EnvCfg,
+        recipe: Recipe,
+        plan: Callable[[WristProblem], WristPlan],
+    ) -> None:
         self.scene: Scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
         self.motion = library.motion(cfg.task.motion)
         self._cfg = cfg
@@ -70,11 +83,23 @@ class EnvBuilder:
         index = self.scene.index
         reference = _reference(cfg.reference, ObjectReference.of(self.motion), self.scene)
         self.expert = library.expert(cfg.task.motion) if recipe.needs_expert else None
+        qpos = torch.from_numpy(start.qpos)
+        self.wrist_problem = WristProblem(
+            self.scene,
+            reference,
+            start.qpos,
+            start.qvel,
+            warm_targets(index, qpos).numpy(),
+            self.motion.substeps,
+            cfg.action.hold_steps,
+        )
+        self.wrist = plan(self.wrist_problem) if cfg.action.plans_wrist else None
+        commands = None if self.wrist is None else torch.from_numpy(self.wrist.commands)
         self.mdp = Mdp(
             reference=reference,
             start=start,
             observe=layout(cfg.obs, index, reference),
-            actions=action_map(cfg.action, index, reference, torch.from_numpy(start.qpos)),
+            actions=action_map(cfg.action, index, reference, qpos, commands),
             recipe=recipe,
             expert=None if self.expert is None else _followed(self.expert, self.scene),
         )
@@ -141,6 +166,8 @@ class EnvBuilder:
             "scene_sha256": self.scene.digest(),
             "pregrasp_used": self.mdp.start.source,
         }
+        if self.wrist is not None:
+            facts["wrist_sha256"] = self.wrist.sha256()
         if self.mdp.start.sha256:
             facts["pregrasp_sha256"] = self.mdp.start.sha256
         if self.ablated is not None:

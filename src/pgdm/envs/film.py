@@ -13,6 +13,7 @@ from pgdm.motion.reference import ObjectReference
 from pgdm.sim.render import Renderer, write_image, write_video
 from pgdm.sim.replay import motion_qpos
 from pgdm.sim.scene import Scene
+from pgdm.wrist.plan import WristPlan
 
 _CLOSE_M = 0.4  # height of the picture around the object where contacts are to be seen
 LAST_FRAME_REPEATS = 12  # half a second to see how it ended
@@ -99,6 +100,31 @@ def film_reach(env: BatchEnv, qpos: np.ndarray, path: Path) -> Path:
     held = pictures[-1:] * LAST_FRAME_REPEATS
     poster = write_video(path, [*pictures, *held], round(1 / env.sim.control_dt_s))
     return write_image(poster, pictures[-1])
+
+
+def film_wrist(env: BatchEnv, plan: WristPlan, path: Path) -> Path:
+    """Write an MP4 of the hand alone on its planned way, the goal as a ghost; return its poster.
+
+    Args:
+        env: the task, in any state.
+        plan: of its wrist.
+        path: of the MP4.
+
+    Raises:
+        RenderError: if no OpenGL works here or the file cannot be written.
+    """
+    scene, reference = env.sim.scene, env.mdp.reference
+    errors_cm = 100 * np.append(0.0, plan.error_m)
+    with _renderer(scene, reference) as renderer:
+        frames = (
+            renderer.render_qpos(
+                row,
+                (reference.pos[t].numpy(), reference.quat[t].numpy()),
+                f"{scene.task.id}  hand alone  step {t}  error {errors_cm[t]:.1f} cm",
+            )
+            for t, row in enumerate(plan.qpos)
+        )
+        return write_video(path, frames, round(1 / env.sim.control_dt_s))
 
 
 def film_expert(

@@ -143,6 +143,10 @@ class SimBatch:
             object_vel=vel[:, -1],
         )
 
+    def body_pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the centre of mass (N, 3) m and orientation (N, 4) wxyz of a body, world frame."""
+        return self._d["xipos"][:, body].copy(), self._d["xquat"][:, body].copy()
+
     def restore(self, rows: np.ndarray) -> None:
         """Continue from rows (N, nstate) that ``rows`` once gave, to the bit.
 

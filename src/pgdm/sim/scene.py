@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -112,6 +113,7 @@ class SimCfg:
 OBJECT_MASSES = ("volume", "published")
 
 
+_NEVER_M = 10.0  # no two geoms are that deep in each other
 _FREE_JOINTS = 6  # three slides and three hinges, as the benchmark has them
 
 
@@ -193,6 +195,22 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
     return Scene(
         model, _index(model, task, hand, randomized), task, hand, library.origins(task.motion)
     )
+
+
+def hand_alone(scene: Scene) -> Scene:
+    """Return a scene in which nothing touches the objects, nor what they hang on.
+
+    They stay where they are in the model, so that its state has the same layout.
+    """
+    model = copy.deepcopy(scene.model)
+    prefixes = tuple(f"{name}/" for name in scene.task.objects)
+    bodies = [model.body(i).name.startswith(prefixes) for i in range(model.nbody)]
+    of_object = np.array(bodies)[model.geom_bodyid]
+    model.geom_contype[of_object] = model.geom_conaffinity[of_object] = 0
+    # Pairs that a model names collide whatever their types: at no distance that occurs.
+    named = of_object[model.pair_geom1] | of_object[model.pair_geom2]
+    model.pair_margin[named] = -_NEVER_M
+    return replace(scene, model=model)
 
 
 def scale_mass(spec: mujoco.MjSpec, ratio: float) -> None:

@@ -1,0 +1,429 @@
+"""Commands of the wrist with which the hand alone follows an exemplar, optimised on the simulator.
+
+The base's servos are soft and underdamped, so that a path sent to them as it is is followed late
+and with a swing of centimetres. Here the commands of all control steps are found together:
+Gauss-Newton on the simulated hand, each step a quadratic program within the control ranges and a
+trust region.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import torch
+from qpsolvers import solve_qp
+from scipy.spatial.transform import Rotation
+
+from pgdm.errors import ConfigError, SceneError
+from pgdm.motion.reference import ObjectReference
+from pgdm.sim.batch import SimBatch
+from pgdm.sim.scene import Scene, hand_alone
+from pgdm.wrist.path import feasible_path
+
+VERSION = 1
+"""Of the planner: stored plans of another are made anew."""
+NEAR_M = 0.01
+"""Error within which a step counts as followed, as in the benchmark's success."""
+
+_SLIDES, _JOINTS = 3, 6  # the base: slides, then hinges
+
+# Residuals are of one size where the errors are as bad: a grasp point 1 cm off, a hand turned by
+# 1.1 rad, a joint 3 mm or 0.01 rad too near its limit.
+_PER_M, _PER_RAD = 100.0, 0.9
+_PER_LIMIT = np.repeat((300.0, 90.0), _SLIDES)
+_MARGIN = np.repeat((0.005, 0.03), _SLIDES)  # m and rad that joints keep from their limits
+# Commands that change little from step to step, and lie near the path, are worth a little.
+_CHANGE, _NEAR_PATH = np.repeat((2.0, 0.6), _SLIDES), 0.2
+_STEP, _STEP_PER_S = 1e-4, 1e-3  # of finite differences, m and rad
+# Of what a step was to gain: below the first the trust region shrinks, above the second it grows.
+_POOR, _GOOD = 0.3, 0.75
+_ENOUGH = 0.01  # a stage ends with a step that lowers the cost by less than this share
+_LEAST_TRUST = 1e-3  # or with a trust region below this, m and rad
+_TINY, _SAME = 1e-9, 1e-6
+_LIMIT_ROUNDS = 6
+_STUCK = 1e3  # kg m^2
+_SMOOTH = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A number of Gauss-Newton steps."""
+
+    rounds: int
+    trust: float
+    """How far a command may move at first, m and rad."""
+
+
+SMOOTH_STAGE, REAL_STAGE = Stage(15, 0.3), Stage(8, 0.03)
+"""First without limits and contacts, whose kinks hide the way; then with them."""
+
+Progress = Callable[[int, int], None]
+"""Told rounds done and rounds at most."""
+
+
+@dataclass(frozen=True)
+class WristProblem:
+    """What the wrist is to do."""
+
+    scene: Scene
+    reference: ObjectReference
+    qpos: np.ndarray  # (nq,) m, rad: the start
+    qvel: np.ndarray  # (nv,) m/s, rad/s
+    fingers: np.ndarray  # (nu,) m, rad: targets that all joints but the base's are held at
+    substeps: int
+    """Physics steps per control step."""
+    hold_steps: int = 0
+    """Control steps for which the hand stays at its start, so that the fingers can close; as many
+    follow in which it may go where it likes, to catch up."""
+
+    def check(self) -> None:
+        """Check that the hand has a base that can be moved.
+
+        Raises:
+            ConfigError: if not.
+        """
+        hand = self.scene.hand
+        if hand.num_base_joints != _JOINTS:
+            raise ConfigError(
+                f"hand '{hand.name}' has {hand.num_base_joints} base joints; a planned wrist needs "
+                "three slides and three hinges; use action=absolute"
+            )
+
+    def key(self) -> str:
+        """Return a SHA-256 over all that a plan depends on."""
+        digest = hashlib.sha256(f"{VERSION} {mujoco.__version__} {self.substeps}".encode())
+        digest.update(f"{self.hold_steps}".encode())
+        digest.update(self.scene.digest().encode())
+        reference = self.reference.pos.numpy(), self.reference.quat.numpy()
+        for array in (*reference, self.qpos, self.qvel, self.fingers):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class WristPlan:
+    """Commands, and what the hand alone does with them."""
+
+    commands: np.ndarray
+    """Targets of the base joints at control steps 0..T-2, (T-1, 6) m, rad."""
+    qpos: np.ndarray
+    """The scene at steps 0..T-1, (T, nq); the object is out of contact."""
+    error_m: np.ndarray
+    """Distance of the grasp point from its target after each step, (T-1,) m."""
+    seconds: float = 0.0
+    """Time the planning took, s."""
+
+    def sha256(self) -> str:
+        """Return a hash of the commands."""
+        return hashlib.sha256(self.commands.tobytes()).hexdigest()
+
+    @property
+    def bound(self) -> float:
+        """Share of the steps at which the grasp point is within 1 cm (0..1).
+
+        What a grasp that never slips would reach. Policies may do better: they correct.
+        """
+        return float((self.error_m < NEAR_M).mean())
+
+
+def plan_wrist(
+    problem: WristProblem, num_threads: int = 0, progress: Progress | None = None
+) -> WristPlan:
+    """Find commands with which the hand alone follows the exemplar.
+
+    Args:
+        problem: what the wrist is to do.
+        num_threads: of the simulations; 0 takes one per core.
+        progress: told how far the search is.
+
+    Raises:
+        ConfigError: if the hand's base is not three slides and three hinges.
+        SceneError: if the simulation of the hand diverges.
+    """
+    problem.check()
+    began, search = time.monotonic(), _Search(problem, num_threads, progress)
+    commands = search.path[1:].copy()
+    for stage, real in ((SMOOTH_STAGE, False), (REAL_STAGE, True)):
+        commands = search.improve(commands, stage, real)
+    return replace(simulate(problem, commands), seconds=time.monotonic() - began)
+
+
+def simulate(problem: WristProblem, commands: np.ndarray) -> WristPlan:
+    """Return what the hand alone does with commands (T-1, 6)."""
+    hand = _Hand(problem, hand_alone(problem.scene))
+    way = hand.rollout(commands)
+    errors = np.linalg.norm(way.points - problem.reference.pos.numpy()[1:], axis=1)
+    return WristPlan(commands, way.qpos, errors)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Where the hand goes in K control steps."""
+
+    qpos: np.ndarray  # (K+1, nq)
+    qvel: np.ndarray  # (K+1, nv)
+    points: np.ndarray  # (K, 3) m, world frame: the grasp point
+    turns: Rotation  # K, of the palm
+
+
+class _Hand:
+    """The hand without objects to touch, one simulation of it."""
+
+    def __init__(self, problem: WristProblem, scene: Scene) -> None:
+        self._problem, hand = problem, scene.hand
+        self.palm = int(scene.model.jnt_bodyid[hand.num_base_joints + hand.num_wrist_joints - 1])
+        self.sim = SimBatch(scene, 1, 1, problem.substeps)
+        self._restart()
+        pos, turn = self._palm(self.sim)
+        self.start_turn = turn[0]
+        self._grasp = turn[0].inv().apply(problem.reference.pos.numpy()[0] - pos[0])
+
+    def rollout(self, commands: np.ndarray) -> _Way:
+        """Return where commands (K, 6) take the hand."""
+        self._restart()
+        states, poses = [self.sim.read()], []
+        ctrl = self._problem.fingers[None].copy()
+        for command in commands:
+            ctrl[0, :_JOINTS] = command
+            if self.sim.step(ctrl).any():
+                task = self._problem.scene.task.id
+                raise SceneError(f"task '{task}': the simulation of the hand alone diverged")
+            states.append(self.sim.read())
+            poses.append(self.grasp_point(self.sim))
+        return _Way(
+            np.concatenate([state.qpos.numpy() for state in states]),
+            np.concatenate([state.qvel.numpy() for state in states]),
+            np.concatenate([points for points, _ in poses]),
+            Rotation.concatenate([turn for _, turn in poses]),
+        )
+
+    def grasp_point(self, sim: SimBatch) -> tuple[np.ndarray, Rotation]:
+        """Return the point that is at the object's centre at the start (N, 3), and the palm's turn."""
+        pos, turn = self._palm(sim)
+        return pos + turn.apply(self._grasp), turn
+
+    def _palm(self, sim: SimBatch) -> tuple[np.ndarray, Rotation]:
+        pos, quat = sim.body_pose(self.palm)
+        return pos, Rotation.from_quat(quat, scalar_first=True)
+
+    def _restart(self) -> None:
+        self.sim.reset(np.array([0]), self._problem.qpos, self._problem.qvel)
+
+
+class _Search:
+    """Gauss-Newton over the commands of all steps."""
+
+    def __init__(self, problem: WristProblem, num_threads: int, progress: Progress | None) -> None:
+        scene, self._problem = problem.scene, problem
+        self._progress, self._rounds = progress, 0
+        low, high = scene.model.jnt_range[:_JOINTS].T
+        index = scene.index
+        self._low, self._high = index.ctrl_low[:_JOINTS], index.ctrl_high[:_JOINTS]
+        self._limits = _Limits(low + _MARGIN, high - _MARGIN)
+        within = replace(
+            index,
+            ctrl_low=np.maximum(self._low, self._limits.low),
+            ctrl_high=np.minimum(self._high, self._limits.high),
+        )
+        self.path = feasible_path(within, problem.reference, torch.from_numpy(problem.qpos)).numpy()
+        alone = hand_alone(scene)
+        model = copy.deepcopy(alone.model)
+        model.opt.disableflags |= _SMOOTH
+        # Fingers that swing freely past their limits would be kinks of another kind.
+        model.dof_armature[scene.hand.num_base_joints + scene.hand.num_wrist_joints : model.nu] = (
+            _STUCK
+        )
+        smooth = replace(alone, model=model)
+        self._hands = {True: _Hand(problem, alone), False: _Hand(problem, smooth)}
+        self._steps = SimBatch(smooth, len(self.path) - 1, num_threads, problem.substeps)
+        base = Rotation.from_euler("XYZ", self.path[:, _SLIDES:])
+        mount = Rotation.from_quat(index.mount_quat, scalar_first=True)
+        carried = mount * base
+        base0 = mount * Rotation.from_euler("XYZ", problem.qpos[_SLIDES:_JOINTS])
+        turns = carried * (base0.inv() * self._hands[True].start_turn)
+        hold, step = problem.hold_steps, np.arange(len(self.path))
+        held = np.where(step <= hold, 0, step)[1:]
+        self._targets, self._turns = problem.reference.pos.numpy()[held], turns[held]
+        self._followed = ((step <= hold) | (step > 2 * hold))[1:, None]
+        # Joints whose motion the base feels, and is felt by: its own and those that turn the palm.
+        self._n = scene.hand.num_base_joints + scene.hand.num_wrist_joints
+
+    def improve(self, commands: np.ndarray, stage: Stage, real: bool) -> np.ndarray:
+        """Return better commands (K, 6), by at most as many steps as a stage has."""
+        hand, trust = self._hands[real], stage.trust
+        commands = commands.clip(self._low, self._high)
+        way = hand.rollout(commands)
+        cost, model = self._cost(commands, way), self._linearise(commands, way)
+        end = self._rounds + stage.rounds
+        while self._rounds < end and trust > _LEAST_TRUST:
+            self._rounds += 1
+            if self._progress is not None:
+                self._progress(self._rounds, SMOOTH_STAGE.rounds + REAL_STAGE.rounds)
+            step = model.least(
+                np.maximum(self._low - commands, -trust), np.minimum(self._high - commands, trust)
+            )
+            tried = (commands + step).clip(self._low, self._high)
+            tried_way = hand.rollout(tried)
+            gained = cost - (tried_cost := self._cost(tried, tried_way))
+            share = gained / max(model.gain(step.ravel()), _TINY)  # of what the model promised
+            if share < _POOR:
+                trust = min(trust, float(np.abs(step).max())) / 4
+            elif share > _GOOD:
+                trust *= 2
+            if gained > 0:
+                finished = gained < _ENOUGH * cost
+                commands, way, cost = tried, tried_way, tried_cost
+                if finished:
+                    break
+                model = self._linearise(commands, way)
+        self._rounds = end
+        return commands
+
+    def _cost(self, commands: np.ndarray, way: _Way) -> float:
+        beyond = self._limits.beyond(way.qpos[1:, :_JOINTS])
+        parts = self._off(way.points, way.turns), *self._unsteady(commands), beyond
+        return sum(float((part**2).sum()) for part in parts)
+
+    def _off(self, points: np.ndarray, turns: Rotation) -> np.ndarray:
+        """Return residuals (K, 6): of the grasp point's position, then of the palm's turn."""
+        turned = (self._turns.inv() * turns).as_rotvec()
+        off = np.concatenate((_PER_M * (points - self._targets), _PER_RAD * turned), 1)
+        return off * self._followed
+
+    def _unsteady(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals (K, 6) each: change of the commands, and their distance to the path."""
+        change = np.diff(np.concatenate((self.path[:1], commands)), axis=0)
+        return _CHANGE * change, _NEAR_PATH * _CHANGE * (commands - self.path[1:])
+
+    def _linearise(self, commands: np.ndarray, way: _Way) -> _Model:
+        """Return the cost around commands, by finite differences of every step, side by side.
+
+        The smooth model serves for both stages: kinks would only make it wrong farther away.
+        """
+        steps, n = len(commands), self._n
+        ctrl = np.repeat(self._problem.fingers[None], steps, 0)
+        ctrl[:, :_JOINTS] = commands
+
+        qpos, qvel = way.qpos[:-1].copy(), way.qvel[:-1].copy()
+
+        def after() -> np.ndarray:
+            self._steps.reset(np.arange(steps), qpos, qvel)
+            self._steps.step(ctrl)
+            state = self._steps.read()
+            off = self._off(*self._hands[True].grasp_point(self._steps))
+            return np.concatenate((state.qpos[:, :n], state.qvel[:, :n], off), 1)
+
+        here, slopes = after(), []
+        # Away from the upper end of the control range, where a command beyond it changes nothing.
+        inward = np.where(commands + _STEP > self._high, -_STEP, _STEP)
+        for array, by in (
+            (qpos, np.full((steps, n), _STEP)),
+            (qvel, np.full((steps, n), _STEP_PER_S)),
+            (ctrl, inward),
+        ):
+            for column in range(by.shape[1]):
+                before = array[:, column].copy()
+                array[:, column] += by[:, column]
+                slopes.append((after() - here) / by[:, column, None])
+                array[:, column] = before
+        slopes = np.stack(slopes, 2)  # (K, 2n+6, 2n+6)
+        size = steps * _JOINTS
+        off_by, joints_by = np.zeros((2, steps, _JOINTS, size))
+        state_by = np.zeros((2 * n, size))
+        for k, slope in enumerate(slopes):
+            chained = slope[:, : 2 * n] @ state_by
+            chained[:, k * _JOINTS : (k + 1) * _JOINTS] += slope[:, 2 * n :]
+            state_by, off_by[k], joints_by[k] = (
+                chained[: 2 * n],
+                chained[2 * n :],
+                chained[:_JOINTS],
+            )
+        change = np.tile(_CHANGE, steps)[:, None] * (np.eye(size) - np.eye(size, k=-_JOINTS))
+        near = np.diag(np.tile(_NEAR_PATH * _CHANGE, steps))
+        residuals = self._off(way.points, way.turns), *self._unsteady(commands)
+        return _Model(
+            np.concatenate((off_by.reshape(size, size), change, near)),
+            np.concatenate([part.ravel() for part in residuals]),
+            joints_by.reshape(size, size),
+            way.qpos[1:, :_JOINTS],
+            self._limits,
+        )
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """What joints keep away from."""
+
+    low: np.ndarray  # (6,) m, rad
+    high: np.ndarray
+
+    def nearest(self, joints: np.ndarray) -> np.ndarray:
+        """Return joints (K, 6) brought within."""
+        return joints.clip(self.low, self.high)
+
+    def beyond(self, joints: np.ndarray) -> np.ndarray:
+        """Return residuals (K, 6) of joints (K, 6): 0 within."""
+        return _PER_LIMIT * (joints - self.nearest(joints))
+
+
+class _Model:
+    """The cost around commands: squares of linear residuals, and of joints beyond their limits.
+
+    Args:
+        jacobian: of the residuals (R, K * 6).
+        residuals: at the commands (R,).
+        joints_by: how the joints depend on the commands (K * 6, K * 6).
+        joints: at the commands (K, 6).
+        limits: that joints keep away from.
+    """
+
+    def __init__(
+        self,
+        jacobian: np.ndarray,
+        residuals: np.ndarray,
+        joints_by: np.ndarray,
+        joints: np.ndarray,
+        limits: _Limits,
+    ) -> None:
+        self._hessian = 2 * jacobian.T @ jacobian + _TINY * np.eye(jacobian.shape[1])
+        self._slope = 2 * jacobian.T @ residuals
+        self._joints_by, self._joints, self._limits = joints_by, joints, limits
+        self._weights = np.tile(_PER_LIMIT, len(joints))
+
+    def least(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Return the best change of the commands within bounds, (K, 6) each.
+
+        Which joints it takes beyond a limit shows only afterwards: some rounds find it.
+        """
+        low, high = low.ravel(), np.maximum(high, low + _TINY).ravel()
+        best = step = np.zeros_like(low)
+        for _ in range(_LIMIT_ROUNDS):
+            joints = self._after(step)
+            limit = self._limits.nearest(joints)
+            rows = self._weights[:, None] * self._joints_by
+            off = (self._weights * (self._joints - limit).ravel())[at := (joints != limit).ravel()]
+            hessian = self._hessian + 2 * rows[at].T @ rows[at]
+            slope = self._slope + 2 * rows[at].T @ off
+            found = solve_qp(hessian, slope, lb=low, ub=high, solver="daqp")
+            if found is None or np.allclose(found, step, atol=_SAME):
+                break
+            step = found
+            best = max(best, step, key=self.gain)
+        return best.reshape(-1, _JOINTS)
+
+    def gain(self, step: np.ndarray) -> float:
+        """Return by how much a change (K * 6,) should lower the cost."""
+        steady = self._slope @ step + 0.5 * step @ self._hessian @ step
+        before, after = (
+            (self._limits.beyond(joints) ** 2).sum() for joints in (self._joints, self._after(step))
+        )
+        return float(before - after - steady)
+
+    def _after(self, step: np.ndarray) -> np.ndarray:
+        return self._joints + (self._joints_by @ step).reshape(-1, _JOINTS)
