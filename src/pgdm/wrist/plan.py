@@ -204,7 +204,7 @@ class _Hand:
         )
 
     def grasp_point(self, sim: SimBatch) -> tuple[np.ndarray, Rotation]:
-        """Return the point that is at the object's centre at the start (N, 3), and the palm's turn."""
+        """Return the point (N, 3) that is the object's centre at the start, and the palm's turn."""
         pos, turn = self._palm(sim)
         return pos + turn.apply(self._grasp), turn
 
@@ -232,13 +232,13 @@ class _Search:
             ctrl_high=np.minimum(self._high, self._limits.high),
         )
         self.path = feasible_path(within, problem.reference, torch.from_numpy(problem.qpos)).numpy()
+        # Joints whose motion the base feels, and is felt by: its own and those that turn the palm.
+        self._n = scene.hand.num_base_joints + scene.hand.num_wrist_joints
         alone = hand_alone(scene)
         model = copy.deepcopy(alone.model)
         model.opt.disableflags |= _SMOOTH
         # Fingers that swing freely past their limits would be kinks of another kind.
-        model.dof_armature[scene.hand.num_base_joints + scene.hand.num_wrist_joints : model.nu] = (
-            _STUCK
-        )
+        model.dof_armature[self._n : model.nu] = _STUCK
         smooth = replace(alone, model=model)
         self._hands = {True: _Hand(problem, alone), False: _Hand(problem, smooth)}
         self._steps = SimBatch(smooth, len(self.path) - 1, num_threads, problem.substeps)
@@ -249,10 +249,8 @@ class _Search:
         turns = carried * (base0.inv() * self._hands[True].start_turn)
         hold, step = problem.hold_steps, np.arange(len(self.path))
         held = np.where(step <= hold, 0, step)[1:]
-        self._targets, self._turns = problem.reference.pos.numpy()[held], turns[held]
+        self._targets, self._turns = problem.reference.pos.numpy()[held], turns[held.tolist()]
         self._followed = ((step <= hold) | (step > 2 * hold))[1:, None]
-        # Joints whose motion the base feels, and is felt by: its own and those that turn the palm.
-        self._n = scene.hand.num_base_joints + scene.hand.num_wrist_joints
 
     def improve(self, commands: np.ndarray, stage: Stage, real: bool) -> np.ndarray:
         """Return better commands (K, 6), by at most as many steps as a stage has."""

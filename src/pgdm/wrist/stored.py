@@ -77,8 +77,9 @@ class WristPlans:
             )
             write(stored, plan, problem)
         self._notify(
-            f"{stored}: in {plan.seconds:.0f} s; the hand alone is {1e3 * plan.error_m.mean():.1f} mm "
-            f"off on average, within 1 cm in {plan.bound:.0%} of the steps"
+            f"{stored}: in {plan.seconds:.0f} s; the hand alone is "
+            f"{1e3 * plan.error_m.mean():.1f} mm off on average, within 1 cm in {plan.bound:.0%} "
+            "of the steps"
         )
         return plan
 
@@ -98,7 +99,7 @@ def write(path: Path, plan: WristPlan, problem: WristProblem) -> None:
     """
     arrays = {"commands": plan.commands, "qpos": plan.qpos, "error_m": plan.error_m}
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, key=np.frombuffer(problem.key().encode(), np.uint8), **arrays)
+    np.savez_compressed(buffer, **arrays, key=_key(problem))  # type: ignore[arg-type]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with paths.replacing(path) as temp:
@@ -117,13 +118,13 @@ def read(path: Path, problem: WristProblem) -> WristPlan:
     steps, nq = len(problem.reference) - 1, problem.scene.model.nq
     shapes = {"commands": (steps, 6), "qpos": (steps + 1, nq), "error_m": (steps,)}
     for name, shape in shapes.items():
-        array = arrays.get(name)
-        fits = isinstance(array, np.ndarray) and array.shape == shape and array.dtype == np.float64
-        if not fits or not np.isfinite(array).all():
+        array = np.asarray(arrays.get(name, []), float)
+        if np.shape(array) != shape or not np.isfinite(array).all():
             raise CorruptAssetError(f"{path}: '{name}' is not {shape} finite numbers")
-    if (
-        np.asarray(arrays.get("key", []), np.uint8).tobytes().decode("ascii", "replace")
-        != problem.key()
-    ):
+    if not np.array_equal(arrays.get("key", []), _key(problem)):
         raise CorruptAssetError(f"{path} is the plan of another task, hand or start")
     return WristPlan(arrays["commands"], arrays["qpos"], arrays["error_m"])
+
+
+def _key(problem: WristProblem) -> np.ndarray:
+    return np.frombuffer(problem.key().encode(), np.uint8)
