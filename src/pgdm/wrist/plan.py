@@ -116,8 +116,10 @@ class WristPlan:
     """The scene at steps 0..T-1, (T, nq); the object is out of contact."""
     error_m: np.ndarray
     """Distance of the grasp point from its target after each step, (T-1,) m."""
+    frames: int = 0
+    """Control steps that were simulated to find it."""
     seconds: float = 0.0
-    """Time the planning took, s."""
+    """Time that took, s."""
 
     def sha256(self) -> str:
         """Return a hash of the commands."""
@@ -151,7 +153,8 @@ def plan_wrist(
     commands = search.path[1:].copy()
     for stage, real in ((SMOOTH_STAGE, False), (REAL_STAGE, True)):
         commands = search.improve(commands, stage, real)
-    return replace(simulate(problem, commands), seconds=time.monotonic() - began)
+    seconds = time.monotonic() - began
+    return replace(simulate(problem, commands), frames=search.frames, seconds=seconds)
 
 
 def simulate(problem: WristProblem, commands: np.ndarray) -> WristPlan:
@@ -221,7 +224,7 @@ class _Search:
 
     def __init__(self, problem: WristProblem, num_threads: int, progress: Progress | None) -> None:
         scene, self._problem = problem.scene, problem
-        self._progress, self._rounds = progress, 0
+        self._progress, self._rounds, self.frames = progress, 0, 0
         low, high = scene.model.jnt_range[:_JOINTS].T
         index = scene.index
         self._low, self._high = index.ctrl_low[:_JOINTS], index.ctrl_high[:_JOINTS]
@@ -256,7 +259,7 @@ class _Search:
         """Return better commands (K, 6), by at most as many steps as a stage has."""
         hand, trust = self._hands[real], stage.trust
         commands = commands.clip(self._low, self._high)
-        way = hand.rollout(commands)
+        way = self._rollout(hand, commands)
         cost, model = self._cost(commands, way), self._linearise(commands, way)
         end = self._rounds + stage.rounds
         while self._rounds < end and trust > _LEAST_TRUST:
@@ -267,7 +270,7 @@ class _Search:
                 np.maximum(self._low - commands, -trust), np.minimum(self._high - commands, trust)
             )
             tried = (commands + step).clip(self._low, self._high)
-            tried_way = hand.rollout(tried)
+            tried_way = self._rollout(hand, tried)
             gained = cost - (tried_cost := self._cost(tried, tried_way))
             share = gained / max(model.gain(step.ravel()), _TINY)  # of what the model promised
             if share < _POOR:
@@ -282,6 +285,10 @@ class _Search:
                 model = self._linearise(commands, way)
         self._rounds = end
         return commands
+
+    def _rollout(self, hand: _Hand, commands: np.ndarray) -> _Way:
+        self.frames += len(commands)
+        return hand.rollout(commands)
 
     def _cost(self, commands: np.ndarray, way: _Way) -> float:
         beyond = self._limits.beyond(way.qpos[1:, :_JOINTS])
@@ -311,6 +318,7 @@ class _Search:
         qpos, qvel = way.qpos[:-1].copy(), way.qvel[:-1].copy()
 
         def after() -> np.ndarray:
+            self.frames += steps
             self._steps.reset(np.arange(steps), qpos, qvel)
             self._steps.step(ctrl)
             state = self._steps.read()

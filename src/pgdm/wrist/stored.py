@@ -98,6 +98,7 @@ def write(path: Path, plan: WristPlan, problem: WristProblem) -> None:
         LibraryError: it cannot be written.
     """
     arrays = {"commands": plan.commands, "qpos": plan.qpos, "error_m": plan.error_m}
+    arrays["effort"] = np.array([plan.frames, plan.seconds])
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays, key=_key(problem))  # type: ignore[arg-type]
     try:
@@ -116,14 +117,15 @@ def read(path: Path, problem: WristProblem) -> WristPlan:
     """
     arrays = safe_npz.read_npz(path)
     steps, nq = len(problem.reference) - 1, problem.scene.model.nq
-    shapes = {"commands": (steps, 6), "qpos": (steps + 1, nq), "error_m": (steps,)}
+    shapes = {"commands": (steps, 6), "qpos": (steps + 1, nq), "error_m": (steps,), "effort": (2,)}
     for name, shape in shapes.items():
         array = np.asarray(arrays.get(name, []), float)
         if np.shape(array) != shape or not np.isfinite(array).all():
             raise CorruptAssetError(f"{path}: '{name}' is not {shape} finite numbers")
     if not np.array_equal(arrays.get("key", []), _key(problem)):
         raise CorruptAssetError(f"{path} is the plan of another task, hand or start")
-    return WristPlan(arrays["commands"], arrays["qpos"], arrays["error_m"])
+    frames, seconds = arrays["effort"].tolist()
+    return WristPlan(arrays["commands"], arrays["qpos"], arrays["error_m"], int(frames), seconds)
 
 
 def _key(problem: WristProblem) -> np.ndarray:

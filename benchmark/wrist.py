@@ -1,0 +1,114 @@
+"""How near the wrist's prior brings the hand to each motion: geometry, and the hand alone.
+
+    python benchmark/wrist.py                plan what is missing of all 51 tasks, print the table
+    python benchmark/wrist.py quick6         of a suite
+    python benchmark/wrist.py --table        print the table of what is stored
+
+Results are stored task by task in results/wrist.json; plans also go to the library, where trainings
+find them. Run it on an idle machine if the times are to mean something.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from pgdm.config.store import compose
+from pgdm.config.suites import suite
+from pgdm.envs.build import EnvBuilder
+from pgdm.experiment import assets, env_builder
+from pgdm.tracking.run_folder import read_json, write_json
+from pgdm.wrist.path import clipped_path, feasible_path
+from pgdm.wrist.plan import WristPlan
+
+RESULTS = Path(__file__).parent / "results" / "wrist.json"
+TASKS = (*suite("tcdm50"), "dmanus-sim2real")
+
+
+def measure(task: str) -> dict[str, Any]:
+    """Return a task's figures: distances in mm, angles in rad, shares, times in s."""
+    cfg = compose([f"task={task}", "+experiment=fast"])
+    free = replace(cfg, action=replace(cfg.action, hold_steps=0))
+    builder, unheld = (env_builder(c, assets(c, print), print) for c in (cfg, free))
+    assert builder.wrist is not None and unheld.wrist is not None
+    return {
+        "steps": len(builder.wrist.error_m),
+        **geometry(builder),
+        "planned": figures(unheld.wrist),
+        "held": figures(builder.wrist),
+        "hold_steps": cfg.action.hold_steps,
+        "paper_success": cfg.task.paper_success,
+    }
+
+
+def geometry(builder: EnvBuilder) -> dict[str, float]:
+    """Return how far clipped and feasible path have the grasp point from the motion, on average."""
+    index, reference = builder.scene.index, builder.mdp.reference
+    start = torch.from_numpy(builder.mdp.start.qpos)
+    mount = Rotation.from_quat(index.mount_quat, scalar_first=True)
+    targets = mount.inv().apply(reference.pos.numpy() - index.mount_pos)
+    grasp = _turns(start[None].numpy())[0].inv().apply(targets[0] - start[:3].numpy())
+    result = {}
+    for name, path_of in (("clipped", clipped_path), ("feasible", feasible_path)):
+        path = path_of(index, reference, start).numpy()
+        off = np.linalg.norm(path[:, :3] + _turns(path).apply(grasp) - targets, axis=1)
+        result[f"{name}_mm"] = round(1e3 * float(off.mean()), 1)
+    return result
+
+
+def _turns(joints: np.ndarray) -> Rotation:
+    return Rotation.from_euler("XYZ", joints[:, 3:6])
+
+
+def figures(plan: WristPlan) -> dict[str, float]:
+    """Return what the hand alone reaches with a plan."""
+    return {
+        "mean_mm": round(1e3 * float(plan.error_m.mean()), 1),
+        "max_mm": round(1e3 * float(plan.error_m.max()), 1),
+        "bound": round(plan.bound, 3),
+        "frames": plan.frames,
+        "seconds": round(plan.seconds, 1),
+    }
+
+
+def table(stored: dict[str, Any]) -> str:
+    """Return the stored figures as a table in Markdown, worst bound first."""
+    lines = [
+        "| task | steps | `clipped`, `feasible`: mean [mm] | `planned`: mean, largest [mm] | bound "
+        "| with the hold | paper |",
+        "|---|--:|--:|--:|--:|--:|--:|",
+    ]
+    for task, row in sorted(stored.items(), key=lambda item: item[1]["planned"]["bound"]):
+        free, paper = row["planned"], row["paper_success"]
+        lines.append(
+            f"| {task} | {row['steps']} | {row['clipped_mm']}, {row['feasible_mm']} "
+            f"| {free['mean_mm']}, {free['max_mm']} | {free['bound']:.1%} "
+            f"| {row['held']['bound']:.1%} | {'' if paper is None else f'{paper:.1%}'} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Plan what is missing, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("suite", nargs="?", help="suite to plan [all 51 tasks]")
+    parser.add_argument("--table", action="store_true", help="only print what is stored")
+    args = parser.parse_args()
+    stored = read_json(RESULTS) if RESULTS.is_file() else {}
+    for task in () if args.table else suite(args.suite) if args.suite else TASKS:
+        if task not in stored:
+            stored[task] = measure(task)
+            print(task, json.dumps(stored[task]), flush=True)
+            write_json(RESULTS, stored)
+    print(table(stored))
+
+
+if __name__ == "__main__":
+    main()
