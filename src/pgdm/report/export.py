@@ -66,14 +66,14 @@ def tasks(results: Results, rows: Iterable[TaskRow], out: Path) -> None:
     head = ["task", "setting", "pregrasp_source", "seeds_finished", "seeds", "frames", "success"]
     head += ["success_mean_action", "com_error_released", "lifted", "hand_error_m"]
     head += ["contact_distance_m", "paper_success", "paper_com_error", "difference"]
-    head += ["null_success", "comparable_with_paper"]
+    head += ["null_success", "wrist_bound", "comparable_with_paper"]
     table = [
         [
             *(row.task, results.labels[row.setting], row.source, row.done),
             " ".join(f"{seed}:{state}" for seed, state in row.seeds.items()),
             *(row.frames, row.success, row.success_mean_action, row.error, row.lifted),
             *(row.fingertips, row.contacts),
-            *(row.paper_success, row.paper_error, row.difference, row.null),
+            *(row.paper_success, row.paper_error, row.difference, row.null, row.bound),
             "yes" if row.comparable else "no",
         ]
         for row in rows

@@ -9,6 +9,7 @@ import numpy as np
 from pgdm.report.results import Results, average, known, paper
 from pgdm.report.runs import CONTACTS, ERROR, FINGERTIPS, LIFTED, SUCCESS, SUCCESS_MEAN, Run
 from pgdm.report.settings import Setting
+from pgdm.tracking.run_folder import WRIST_BOUND
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class TaskRow:
     paper_error: float
     null: float
     """Success if the object never moves."""
+    bound: float
+    """Success of the hand alone on its planned way; NaN where no wrist was planned."""
     comparable: bool
     """Whether the paper's figures were made the same way."""
 
@@ -47,6 +50,11 @@ class TaskRow:
     def follows(self) -> bool:
         """Whether it is known how far the hand was from the expert's."""
         return bool(np.isfinite([self.fingertips, self.contacts]).any())
+
+    @property
+    def planned(self) -> bool:
+        """Whether the bound is known."""
+        return bool(np.isfinite(self.bound))
 
     @property
     def idle(self) -> bool:
@@ -88,6 +96,7 @@ def task_rows(results: Results, setting: Setting) -> list[TaskRow]:
                 paper_success=known(runs[0], "paper_success"),
                 paper_error=known(runs[0], "paper_com_error"),
                 null=paper()["null_policy"].get(task, np.nan),
+                bound=average(float(run.result.get(WRIST_BOUND, np.nan)) for run in done),
                 comparable=comparable,
             )
         )

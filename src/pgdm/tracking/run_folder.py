@@ -28,6 +28,8 @@ ARTIFACTS = "mlflow-artifacts"
 STATUSES = ("running", "finished", "interrupted", "failed")
 ENDED_BY, TIME_LIMIT = "ended_by", "time_limit"
 """Key in ``result.json`` of a finished run, and its value if the time ended it; else ``frames``."""
+WRIST_BOUND = "wrist_bound"
+"""Key in ``result.json``: success of the hand alone, if the wrist was planned (0..1)."""
 LOCK = ".lock"
 """Held by the process that works in the folder."""
 SILENT_S = 600.0
