@@ -130,8 +130,9 @@ def read(path: Path, problem: WristProblem) -> WristPlan:
 
 def _is_finite(array: object, shape: tuple[int, ...]) -> bool:
     # Of one type: the hash of the commands is over their bytes.
-    is_float = isinstance(array, np.ndarray) and array.dtype == np.float64
-    return is_float and array.shape == shape and bool(np.isfinite(array).all())
+    if not (isinstance(array, np.ndarray) and array.dtype == np.float64):
+        return False
+    return array.shape == shape and bool(np.isfinite(array).all())
 
 
 def _key(problem: WristProblem) -> np.ndarray:
