@@ -52,17 +52,6 @@ def search(problem: WristProblem) -> planner._Search:
     return planner._Search(problem, 1, None)
 
 
-@pytest.fixture
-def own_library(library_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a library with all tasks that may be written to; ``PGDM_HOME`` has it."""
-    library = tmp_path / "home" / "library"
-    library.mkdir(parents=True)
-    for source in ("checkout", "animated"):
-        (library / source).symlink_to(library_home / "library" / source)
-    monkeypatch.setenv("PGDM_HOME", str(library.parent))
-    return library
-
-
 def scene(task: str) -> Scene:
     cfg = compose([f"task={task}"])
     return build_scene(open_library(), cfg.task, cfg.hand, cfg.sim)
@@ -119,7 +108,12 @@ def test_a_hand_that_is_held_stays_and_then_catches_up(problem: WristProblem) ->
 
 
 def test_a_key_tells_all_that_a_plan_depends_on(problem: WristProblem) -> None:
+    scene = problem.scene
+    heavy = replace(scene.index, num_compensated=6)
+    stiff = replace(scene.hand, num_wrist_joints=0)
     others = [
+        replace(problem, scene=replace(scene, index=heavy)),
+        replace(problem, scene=replace(scene, hand=stiff)),
         replace(problem, substeps=problem.substeps + 1),
         replace(problem, hold_steps=1),
         replace(problem, qpos=problem.qpos + 1e-9),
