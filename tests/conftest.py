@@ -118,6 +118,20 @@ def expert_home() -> Path:
     return _expert_home(CHECKOUT)
 
 
+@pytest.fixture
+def own_library(library_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a library with all tasks that may be written to, such as with plans of wrists.
+
+    ``PGDM_HOME`` names it.
+    """
+    library = tmp_path / "home" / "library"
+    library.mkdir(parents=True)
+    for source in ("checkout", "animated"):
+        (library / source).symlink_to(library_home / "library" / source)
+    monkeypatch.setenv("PGDM_HOME", str(library.parent))
+    return library
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Before a test's fixtures: ``PGDM_HOME`` is the filled one if it asks, else a missing one.

@@ -127,7 +127,7 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_recipes_for_an_object_and_its_task(
-    tmp_path: Path, library_home: Path, hurried: None
+    tmp_path: Path, own_library: Path, hurried: None
 ) -> None:
     for heading in ("An object", "A task"):
         _follow(heading, tmp_path)
@@ -157,7 +157,7 @@ def test_recipe_for_a_pregrasp_source(tmp_path: Path, library_home: Path) -> Non
 
 
 @pytest.mark.slow
-def test_the_worked_example_of_authoring(tmp_path: Path, library_home: Path) -> None:
+def test_the_worked_example_of_authoring(tmp_path: Path, own_library: Path) -> None:
     _follow("A worked example", tmp_path, "authoring.md")
     _run_python("pawn.py")
     for words in _author_commands("authoring.md", "A worked example"):

@@ -41,13 +41,14 @@ NARROW: dict[str, set[str]] = {"rl": BASE}
 
 # Who may import a third-party package; a package that is not listed may be imported anywhere.
 ALLOWED: dict[str, set[str]] = {
-    "mujoco": {"library", "motion", "sim", "pregrasp", "author", "realworld"},
+    "mujoco": {"library", "motion", "sim", "pregrasp", "wrist", "author", "realworld"},
     "torchrl": {"envs.torchrl", "rl"},
     "hydra": {"config.store", "sweep.expand", "cli", "hydra_plugins"},
     "omegaconf": {"config.store", "sweep.expand", "sweep.planning", "cli", "hydra_plugins"},
     "mlflow": {"tracking", "report"},
     "submitit": {"sweep.slurm"},
     "mink": {"pregrasp"},
+    "qpsolvers": {"wrist"},
     "viser": {"pregrasp"},
     "trimesh": {"library", "pregrasp"},
     "coacd": {"library"},

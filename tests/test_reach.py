@@ -288,7 +288,8 @@ def test_failures_are_listed_and_told_by_the_exit_code() -> None:
     assert wrong.code == 2
     assert "unknown --source 'moccap'; did you mean mocap? valid: labeled" in wrong.errors[0]
     both = command("pgdm", "view", EASY, "--reach", "--expert")
-    assert both.errors == ["error: --reach goes without --ablations and --expert"]
+    told = "error: --reach, --wrist, --ablations and --expert exclude each other"
+    assert both.errors == [told]
 
 
 @pytest.mark.slow

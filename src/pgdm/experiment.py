@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import harmonic_mean
 from typing import Any
@@ -134,7 +134,9 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
     try:
         return notes(cfg, _env_builder(cfg, library, _log.warning, progress=None))
     except PlanMissingError as missing:
-        return [str(missing)]
+        # Nothing else that a run says depends on the wrist's path.
+        other = replace(cfg, action=replace(cfg.action, wrist_path="clipped"))
+        return [str(missing), *notes(cfg, _env_builder(other, library, _log.warning, None))]
 
 
 def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:

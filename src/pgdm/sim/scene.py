@@ -145,6 +145,8 @@ class Scene:
     hand: HandCfg
     asset_source: str
     """The library's source that serves the task's assets, or its sources: ``own+checkout``."""
+    object_prefixes: tuple[str, ...]
+    """How names of the objects' bodies begin; not always with the library's name."""
 
     @property
     def lies_free(self) -> bool:
@@ -192,9 +194,9 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
         model = compile_tracked(spec, task.tracked_body)
     except ValueError as error:
         raise SceneError(f"the scene of task '{task.id}' does not compile: {error}") from error
-    return Scene(
-        model, _index(model, task, hand, randomized), task, hand, library.origins(task.motion)
-    )
+    index, origins = _index(model, task, hand, randomized), library.origins(task.motion)
+    prefixes = tuple(f"{part.modelname}/" for part in parts[1:])
+    return Scene(model, index, task, hand, origins, prefixes)
 
 
 def hand_alone(scene: Scene) -> Scene:
@@ -203,13 +205,13 @@ def hand_alone(scene: Scene) -> Scene:
     They stay where they are in the model, so that its state has the same layout.
     """
     model = copy.deepcopy(scene.model)
-    prefixes = tuple(f"{name}/" for name in scene.task.objects)
-    bodies = [model.body(i).name.startswith(prefixes) for i in range(model.nbody)]
+    bodies = [model.body(i).name.startswith(scene.object_prefixes) for i in range(model.nbody)]
     of_object = np.array(bodies)[model.geom_bodyid]
     model.geom_contype[of_object] = model.geom_conaffinity[of_object] = 0
-    # Pairs that a model names collide whatever their types: at no distance that occurs.
+    # Pairs that a model names collide whatever their types: they push at no depth that occurs. The
+    # gap has them found as before, since some shapes take a margin below 0 for depth.
     named = of_object[model.pair_geom1] | of_object[model.pair_geom2]
-    model.pair_margin[named] = -_NEVER_M
+    model.pair_margin[named], model.pair_gap[named] = -_NEVER_M, _NEVER_M
     return replace(scene, model=model)
 
 

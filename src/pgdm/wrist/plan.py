@@ -98,8 +98,14 @@ class WristProblem:
     def key(self) -> str:
         """Return a SHA-256 over all that a plan depends on."""
         digest = hashlib.sha256(f"{VERSION} {mujoco.__version__} {self.substeps}".encode())
-        digest.update(f"{self.hold_steps}".encode())
-        digest.update(self.scene.digest().encode())
+        scene = self.scene
+        joints = (
+            scene.hand.num_base_joints,
+            scene.hand.num_wrist_joints,
+            scene.index.num_compensated,
+        )
+        digest.update(f"{self.hold_steps} {joints}".encode())
+        digest.update(scene.digest().encode())
         reference = self.reference.pos.numpy(), self.reference.quat.numpy()
         for array in (*reference, self.qpos, self.qvel, self.fingers):
             digest.update(np.ascontiguousarray(array).tobytes())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -54,10 +55,11 @@ class WristPlans:
         """Return a problem's plan.
 
         Raises:
-            PlanMissingError: it is not there, and is not to be made.
             ConfigError: the hand's base cannot follow a plan.
+            PlanMissingError: it is not there, and is not to be made.
             LibraryError: it cannot be stored.
         """
+        problem.check()
         stored = path_of(self._library, problem)
         places = (stored,) if self._run is None else (self._run / FILE, stored)
         for path in places:
@@ -66,10 +68,9 @@ class WristPlans:
         task = problem.scene.task.id
         if self._progress is None:
             raise PlanMissingError(f"the wrist of '{task}' is planned first")
-        problem.check()
         with staging.locked(self._library):
-            if (plan := self._found(stored, problem)) is not None:  # another process was first
-                return plan
+            with suppress(CorruptAssetError):  # another process was first
+                return read(stored, problem)
             self._notify(f"the wrist of '{task}' is not planned yet: doing it once")
             progress = self._progress
             plan = plan_wrist(
@@ -87,7 +88,7 @@ class WristPlans:
         try:
             return read(path, problem) if path.is_file() else None
         except CorruptAssetError as error:
-            self._notify(f"{error}; planning anew")
+            self._notify(f"{error}; it is not used")
             return None
 
 
@@ -119,13 +120,19 @@ def read(path: Path, problem: WristProblem) -> WristPlan:
     steps, nq = len(problem.reference) - 1, problem.scene.model.nq
     shapes = {"commands": (steps, 6), "qpos": (steps + 1, nq), "error_m": (steps,), "effort": (2,)}
     for name, shape in shapes.items():
-        array = np.asarray(arrays.get(name, []), float)
-        if np.shape(array) != shape or not np.isfinite(array).all():
+        if not _is_finite(arrays.get(name), shape):
             raise CorruptAssetError(f"{path}: '{name}' is not {shape} finite numbers")
     if not np.array_equal(arrays.get("key", []), _key(problem)):
         raise CorruptAssetError(f"{path} is the plan of another task, hand or start")
     frames, seconds = arrays["effort"].tolist()
     return WristPlan(arrays["commands"], arrays["qpos"], arrays["error_m"], int(frames), seconds)
+
+
+def _is_finite(array: object, shape: tuple[int, ...]) -> bool:
+    # Of one type: the hash of the commands is over their bytes.
+    if not (isinstance(array, np.ndarray) and array.dtype == np.float64):
+        return False
+    return array.shape == shape and bool(np.isfinite(array).all())
 
 
 def _key(problem: WristProblem) -> np.ndarray:

@@ -1,0 +1,480 @@
+"""The wrist planner: its parts by hand, its plan of the shortest task, and how plans are kept."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from command_line import TINY_SAC, Outcome, command
+from pgdm.config.store import compose
+from pgdm.errors import (
+    ConfigError,
+    CorruptAssetError,
+    LibraryError,
+    PlanMissingError,
+    RenderError,
+)
+from pgdm.experiment import env_builder, foreseen
+from pgdm.library import open_library
+from pgdm.library.report import silent
+from pgdm.sim import gl
+from pgdm.sim.scene import Scene, build_scene, hand_alone
+from pgdm.tracking.run_folder import read_json
+from pgdm.wrist import plan as planner
+from pgdm.wrist import stored
+from pgdm.wrist.plan import SMOOTH_STAGE, Stage, WristPlan, WristProblem, plan_wrist, simulate
+from pgdm.wrist.stored import FILE, WristPlans, path_of, read, write
+
+TASK = "duck-lift"
+"""The shortest: 20 steps."""
+
+
+@pytest.fixture(scope="module")
+def problem(library_home: Path) -> WristProblem:
+    return env_builder(compose([f"task={TASK}"]), open_library()).wrist_problem
+
+
+@pytest.fixture(scope="module")
+def plan(problem: WristProblem) -> WristPlan:
+    return plan_wrist(problem, num_threads=1)
+
+
+@pytest.fixture
+def search(problem: WristProblem) -> planner._Search:
+    return planner._Search(problem, 1, None)
+
+
+def scene(task: str) -> Scene:
+    cfg = compose([f"task={task}"])
+    return build_scene(open_library(), cfg.task, cfg.hand, cfg.sim)
+
+
+# The planner
+
+
+def test_a_plan_is_what_the_simulator_does_with_its_commands(
+    problem: WristProblem, plan: WristPlan
+) -> None:
+    again = simulate(problem, plan.commands)
+    np.testing.assert_array_equal(again.qpos, plan.qpos)
+    np.testing.assert_array_equal(again.error_m, plan.error_m)
+    assert plan.qpos.shape == (len(problem.reference), problem.scene.model.nq)
+    assert plan.frames > 0 and plan.seconds > 0
+
+
+def test_commands_and_joints_keep_their_ranges(problem: WristProblem, plan: WristPlan) -> None:
+    index, joints = problem.scene.index, plan.qpos[:, :6]
+    assert (plan.commands >= index.ctrl_low[:6]).all()
+    assert (plan.commands <= index.ctrl_high[:6]).all()
+    low, high = problem.scene.model.jnt_range[:6].T
+    assert (joints >= low - 1e-3).all()
+    assert (joints <= high + 1e-3).all()
+
+
+def test_a_plan_is_far_nearer_than_its_path_sent_as_it_is(
+    problem: WristProblem, plan: WristPlan, search: planner._Search
+) -> None:
+    sent = simulate(problem, search.path[1:])
+    assert plan.bound >= 0.95
+    assert plan.error_m.mean() < 0.1 * sent.error_m.mean()
+
+
+def test_the_number_of_threads_changes_nothing(problem: WristProblem, plan: WristPlan) -> None:
+    told: list[tuple[int, int]] = []
+    two = plan_wrist(problem, 2, lambda done, rounds: told.append((done, rounds)))
+    np.testing.assert_array_equal(two.commands, plan.commands)
+    assert [done for done, _ in told] == sorted({done for done, _ in told})
+    assert all(done <= rounds for done, rounds in told)
+
+
+def test_a_hand_that_is_held_stays_and_then_catches_up(problem: WristProblem) -> None:
+    hold = 4
+    held = replace(problem, hold_steps=hold)
+    assert held.key() != problem.key()
+    plan = plan_wrist(held, num_threads=1)
+    points = planner._Hand(held, hand_alone(held.scene)).rollout(plan.commands).points
+    away = np.linalg.norm(points - held.reference.pos.numpy()[0], axis=1)
+    assert away[:hold].max() < 0.01
+    assert plan.error_m[:hold].max() > 0.05  # the motion goes on meanwhile
+    assert plan.error_m[2 * hold :].max() < 0.01
+
+
+def test_a_key_tells_all_that_a_plan_depends_on(problem: WristProblem) -> None:
+    scene = problem.scene
+    heavy = replace(scene.index, num_compensated=6)
+    stiff = replace(scene.hand, num_wrist_joints=0)
+    others = [
+        replace(problem, scene=replace(scene, index=heavy)),
+        replace(problem, scene=replace(scene, hand=stiff)),
+        replace(problem, substeps=problem.substeps + 1),
+        replace(problem, hold_steps=1),
+        replace(problem, qpos=problem.qpos + 1e-9),
+        replace(problem, qvel=problem.qvel + 1e-9),
+        replace(problem, fingers=problem.fingers + 1e-9),
+    ]
+    assert len({problem.key(), *(other.key() for other in others)}) == 1 + len(others)
+
+
+def test_a_command_at_the_upper_end_of_its_range_comes_down_again(search: planner._Search) -> None:
+    # Differences beyond the range are zero: taken outward, they had such commands stay for good.
+    top = np.repeat(search._high[None], len(search.path) - 1, axis=0)
+    way = search._hands[False].rollout(top)
+    model = search._linearise(top, way)
+    assert (np.diag(model._joints_by) > 0).all()
+    better = search.improve(top, Stage(2, SMOOTH_STAGE.trust), real=False)
+    cost = search._cost(better, search._hands[False].rollout(better))
+    assert cost < 0.1 * search._cost(top, way)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_model_with_limits_finds_its_least(seed: int) -> None:
+    random, size = np.random.default_rng(seed), 12
+    jacobian, residuals = 30 * random.normal(size=(20, size)), random.normal(size=20)
+    joints_by = np.tril(random.uniform(0.2, 1, (size, size)))
+    limits = planner._Limits(np.full(6, -0.1), np.full(6, 0.1))
+    joints = random.uniform(-0.12, 0.12, (2, 6))
+    model = planner._Model(jacobian, residuals, joints_by, joints, limits)
+    bound = np.full((2, 6), 0.05)
+
+    def cost(step: np.ndarray) -> float:
+        beyond = limits.beyond(joints + (joints_by @ step).reshape(2, 6))
+        return float(((residuals + jacobian @ step) ** 2).sum() + (beyond**2).sum())
+
+    step = model.least(-bound, bound).ravel()
+    assert (np.abs(step) <= 0.05 + 1e-9).all()
+    assert model.gain(step) == pytest.approx(cost(np.zeros(size)) - cost(step), rel=1e-6)
+    options = {"maxiter": 5000, "maxfun": 10**6, "ftol": 1e-15, "gtol": 1e-10}
+    known = minimize(cost, np.zeros(size), bounds=[(-0.05, 0.05)] * size, options=options)
+    assert cost(step) == pytest.approx(known.fun, rel=1e-3)
+
+
+def test_a_hand_without_six_base_joints_is_refused(problem: WristProblem) -> None:
+    hand = replace(problem.scene.hand, num_base_joints=3)
+    other = replace(problem, scene=replace(problem.scene, hand=hand))
+    with pytest.raises(ConfigError, match=r"^hand 'adroit' has 3 base joints; .*absolute$"):
+        plan_wrist(other)
+    # Also where nothing is to be made: it never will be.
+    with pytest.raises(ConfigError, match="3 base joints"):
+        WristPlans(Path("nowhere"), None, print, progress=None)(other)
+
+
+def test_only_residual_actions_plan_the_wrist() -> None:
+    planned = "action.wrist_path=planned"
+    assert compose(["action=residual", planned]).action.plans_wrist
+    assert not compose([planned]).action.plans_wrist
+    assert not compose(["action=residual"]).action.plans_wrist
+
+
+# The hand alone
+
+
+def pushing(model: mujoco.MjModel, qpos: np.ndarray, of_object: np.ndarray) -> int:
+    """Return the number of contacts by which an object's geoms are pushed, or push."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    touching = data.contact.exclude == 0
+    return int((of_object[data.contact.geom].any(axis=1) & touching).sum())
+
+
+@pytest.mark.usefixtures("library_home")
+@pytest.mark.parametrize("task", ["door-open", "hammer-strike"])  # dapg_hammer's is 'dapghammer'
+def test_a_hand_alone_touches_no_object(task: str) -> None:
+    whole = scene(task)
+    before, alone = whole.digest(), hand_alone(whole)
+    model, hand = whole.model, whole.hand
+    robot = [model.body(i).name.startswith((f"{hand.name}/", "table")) for i in range(model.nbody)]
+    of_object = ~np.array(robot)[model.geom_bodyid] & (model.geom_bodyid > 0)
+    # The slides bring the palm's centre into the object's.
+    data = mujoco.MjData(model)
+    data.qpos[:] = open_library().motion(task).starts["planned"].qpos
+    mujoco.mj_forward(model, data)
+    palm = int(model.jnt_bodyid[hand.num_base_joints + hand.num_wrist_joints - 1])
+    by = np.zeros((3, model.nv))
+    mujoco.mj_jacBody(model, data, by, None, palm)
+    away = data.xipos[whole.index.object_body] - data.xipos[palm]
+    data.qpos[:3] += np.linalg.solve(by[:, :3], away)
+    assert pushing(model, data.qpos, of_object) > 4
+    assert pushing(alone.model, data.qpos, of_object) == 0
+    assert (alone.model.nq, alone.model.nv) == (model.nq, model.nv)
+    assert whole.digest() == before != alone.digest()
+    assert (model.pair_margin > -1).all()
+
+
+PAIRED = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/>
+<body name="cup/a"><freejoint/><geom name="cup" type="{}" size=".1 .1 .1"/></body>
+<body name="arm/a"><freejoint/><geom name="arm" type="{}" size=".1 .1 .1"/></body></worldbody>
+<contact><pair geom1="cup" geom2="arm"/><pair geom1="floor" geom2="cup"/></contact></mujoco>"""
+
+
+@pytest.mark.parametrize("shapes", [("sphere", "capsule"), ("box", "box"), ("ellipsoid", "box")])
+def test_pairs_that_a_model_names_do_not_push_either(
+    shapes: tuple[str, str], problem: WristProblem
+) -> None:
+    model = mujoco.MjModel.from_xml_string(PAIRED.format(*shapes))
+    cup, arm = np.array([False, True, False]), np.array([False, False, True])
+    alone = hand_alone(replace(problem.scene, model=model, object_prefixes=("cup/",))).model
+    assert pushing(model, model.qpos0, cup) >= 2
+    assert pushing(alone, model.qpos0, cup) == 0
+    assert pushing(alone, model.qpos0, arm) > 0  # by the floor, as before
+
+
+# What is kept
+
+
+def damaged(path: Path, **changes: object) -> None:
+    """Write a plan's file with other arrays in it; None leaves one out."""
+    with np.load(path) as file:
+        arrays = dict(file) | changes
+    kept = {name: np.asarray(array) for name, array in arrays.items() if array is not None}
+    np.savez(path, **kept)  # type: ignore[arg-type]
+
+
+def nan_within(plan: WristPlan) -> np.ndarray:
+    commands = plan.commands.copy()
+    commands[3, 2] = np.nan
+    return commands
+
+
+DAMAGE: dict[str, Callable[[Path, WristPlan], object]] = {
+    "truncated": lambda path, plan: path.write_bytes(path.read_bytes()[:-300]),
+    "empty": lambda path, plan: path.write_bytes(b""),
+    "garbage": lambda path, plan: path.write_bytes(b"not a zip file at all" * 50),
+    "shape": lambda path, plan: damaged(path, commands=plan.commands[:-1]),
+    "strings": lambda path, plan: damaged(path, commands=plan.commands.astype(str)),
+    "text": lambda path, plan: damaged(path, error_m="far"),
+    "object": lambda path, plan: damaged(path, qpos=np.array({"a": 1}, dtype=object)),
+    "ragged": lambda path, plan: damaged(path, qpos=np.array([[1], [1, 2]], dtype=object)),
+    "complex": lambda path, plan: damaged(path, commands=plan.commands + 0j),
+    "single": lambda path, plan: damaged(path, commands=plan.commands.astype(np.float32)),
+    "nan": lambda path, plan: damaged(path, commands=nan_within(plan)),
+    "missing": lambda path, plan: damaged(path, error_m=None),
+    "no key": lambda path, plan: damaged(path, key=None),
+    "key of strings": lambda path, plan: damaged(path, key=["a"] * 64),
+}
+
+
+def test_a_plan_comes_back_to_the_bit(
+    problem: WristProblem, plan: WristPlan, tmp_path: Path
+) -> None:
+    path = path_of(tmp_path, problem)
+    write(path, plan, problem)
+    back = read(path, problem)
+    for name in ("commands", "qpos", "error_m", "frames", "seconds"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(plan, name), name)
+    assert back.sha256() == plan.sha256()
+    assert path.name.startswith(f"{TASK}-adroit-")
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_a_damaged_plan_is_told_in_a_line(
+    kind: str, problem: WristProblem, plan: WristPlan, tmp_path: Path
+) -> None:
+    path = path_of(tmp_path, problem)
+    write(path, plan, problem)
+    DAMAGE[kind](path, plan)
+    with pytest.raises(CorruptAssetError) as error:
+        read(path, problem)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_the_plan_of_another_problem_is_refused(
+    problem: WristProblem, plan: WristPlan, tmp_path: Path
+) -> None:
+    path = path_of(tmp_path, problem)
+    write(path, plan, replace(problem, hold_steps=3))
+    with pytest.raises(CorruptAssetError, match=r"the plan of another task, hand or start$"):
+        read(path, problem)
+
+
+class Counted:
+    """Stands in for the planner and counts its calls."""
+
+    def __init__(self, plan: WristPlan, takes_s: float = 0.0) -> None:
+        self._plan, self._takes_s, self.calls = plan, takes_s, 0
+
+    def __call__(
+        self, problem: WristProblem, num_threads: int, progress: planner.Progress
+    ) -> WristPlan:
+        self.calls += 1
+        time.sleep(self._takes_s)
+        progress(1, 1)
+        return self._plan
+
+
+@pytest.fixture
+def counted(plan: WristPlan, monkeypatch: pytest.MonkeyPatch) -> Counted:
+    made = Counted(plan)
+    monkeypatch.setattr(stored, "plan_wrist", made)
+    return made
+
+
+def test_a_plan_is_made_once_and_told(
+    problem: WristProblem, counted: Counted, tmp_path: Path
+) -> None:
+    told: list[str] = []
+    progress: list[tuple[str, int, int]] = []
+
+    def note(step: str, done: int, total: int) -> None:
+        progress.append((step, done, total))
+
+    plans = WristPlans(tmp_path, None, told.append, note)
+    first, second = plans(problem), plans(problem)
+    assert counted.calls == 1
+    assert first.sha256() == second.sha256()
+    assert progress == [("wrist plan", 1, 1)]
+    begun, finished = told
+    assert begun == f"the wrist of '{TASK}' is not planned yet: doing it once"
+    assert finished.startswith(str(path_of(tmp_path, problem)))
+    assert "within 1 cm in 100% of the steps" in finished
+
+
+def test_a_damaged_plan_is_told_once_and_made_anew(
+    problem: WristProblem, counted: Counted, tmp_path: Path
+) -> None:
+    told: list[str] = []
+    path = path_of(tmp_path, problem)
+    write(path, plan := counted._plan, problem)
+    DAMAGE["strings"](path, plan)
+    again = WristPlans(tmp_path, None, told.append, silent)(problem)
+    assert counted.calls == 1
+    assert [text for text in told if str(path) in text and "it is not used" in text] == told[:1]
+    assert read(path, problem).sha256() == again.sha256() == plan.sha256()
+
+
+def test_a_plan_that_may_not_be_made_is_missed(
+    problem: WristProblem, counted: Counted, tmp_path: Path
+) -> None:
+    plans = WristPlans(tmp_path / "library", None, print, progress=None)
+    with pytest.raises(PlanMissingError, match=f"^the wrist of '{TASK}' is planned first$"):
+        plans(problem)
+    assert counted.calls == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_runs_own_plan_goes_first(
+    problem: WristProblem, counted: Counted, tmp_path: Path
+) -> None:
+    told: list[str] = []
+    library, run, plan = tmp_path / "library", tmp_path / "run", counted._plan
+    own = replace(plan, commands=plan.commands + 1e-9)
+    write(path_of(library, problem), plan, problem)
+    write(run / FILE, own, problem)
+    plans = WristPlans(library, run, told.append, progress=None)
+    assert plans(problem).sha256() == own.sha256()
+    (run / FILE).write_bytes(b"")
+    assert plans(problem).sha256() == plan.sha256()
+    (note,) = told
+    assert note.startswith(str(run / FILE)) and note.endswith("it is not used")
+
+
+def test_two_at_once_plan_once(
+    problem: WristProblem, plan: WristPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = Counted(plan, takes_s=0.6)
+    monkeypatch.setattr(stored, "plan_wrist", slow)
+    found: list[str] = []
+
+    def run() -> None:
+        found.append(WristPlans(tmp_path, None, print, silent)(problem).sha256())
+
+    both = [threading.Thread(target=run) for _ in range(2)]
+    for thread in both:
+        thread.start()
+    for thread in both:
+        thread.join(timeout=60)
+    assert slow.calls == 1
+    assert found == [plan.sha256()] * 2
+
+
+@pytest.mark.parametrize("place", ["library", "library/wrist"])
+def test_a_library_that_cannot_be_written_is_an_error(
+    place: str, problem: WristProblem, counted: Counted, tmp_path: Path
+) -> None:
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    (tmp_path / place).write_text("a file in the folder's place")
+    with pytest.raises(LibraryError, match=r"library.*: cannot be written \(.*\)$"):
+        WristPlans(tmp_path / "library", None, print, silent)(problem)
+
+
+def test_a_plan_that_is_stopped_leaves_nothing(problem: WristProblem, tmp_path: Path) -> None:
+    def stop(step: str, done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        WristPlans(tmp_path, None, print, stop, num_threads=1)(problem)
+    assert not path_of(tmp_path, problem).exists()
+
+
+# Who uses it
+
+
+def fast_run(*arguments: str) -> Outcome:
+    chosen = "+experiment=fast", f"task={TASK}", "keep_replay=true", "run_dir=run"
+    return command("pgdm-run", "--offline", *TINY_SAC, *chosen, *arguments)
+
+
+def test_a_run_keeps_its_plan_and_goes_on_with_it(
+    own_library: Path, plan: WristPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    first = fast_run()
+    assert (first.code, first.errors) == (0, [])
+    assert "is not planned yet: doing it once" in " ".join(first.err.split())
+    assert read_json(run / "result.json")["wrist_sha256"] == plan.sha256()
+    (kept,) = (own_library / "wrist").iterdir()
+    assert (run / FILE).is_file()
+
+    kept.unlink()
+    monkeypatch.setattr(stored, "plan_wrist", lambda *_: pytest.fail("planned again"))
+    longer = fast_run("total_frames=64")
+    assert (longer.code, longer.errors) == (0, [])
+    result = read_json(run / "result.json")
+    assert (result["frames"], result["wrist_sha256"]) == (64, plan.sha256())
+    evaluated = command("pgdm", "eval", "run", "--offline")
+    assert (evaluated.code, evaluated.errors) == (0, [])
+    assert not kept.exists()
+
+
+def test_a_run_says_beforehand_that_its_wrist_is_planned_first(
+    own_library: Path, problem: WristProblem, plan: WristPlan
+) -> None:
+    cfg = compose(["+experiment=fast", f"task={TASK}", "run_dir=run"])
+    missing, *others = foreseen(cfg, open_library())
+    assert missing == f"the wrist of '{TASK}' is planned first"
+    assert any("the replay takes" in note for note in others)
+    assert not (own_library / "wrist").exists()
+    dry = fast_run("--dry-run")
+    assert dry.code == 0 and missing in " ".join((dry.out + dry.err).split())
+    write(path_of(own_library, problem), plan, problem)
+    assert foreseen(cfg, open_library()) == others
+
+
+def test_a_plan_is_filmed(
+    own_library: Path, problem: WristProblem, plan: WristPlan, tmp_path: Path
+) -> None:
+    try:
+        gl.context_class()
+    except RenderError as error:
+        pytest.skip(str(error))
+    write(path_of(own_library, problem), plan, problem)
+    film = tmp_path / "wrist.mp4"
+    done = command("pgdm", "view", TASK, "--wrist", "--video", str(film), "--offline")
+    assert (done.code, done.errors) == (0, [])
+    assert "within 1 cm in 100% of the steps" in " ".join(done.out.split())
+    assert film.stat().st_size > 10_000
+
+
+def test_views_exclude_each_other() -> None:
+    both = command("pgdm", "view", TASK, "--wrist", "--reach")
+    told = "error: --reach, --wrist, --ablations and --expert exclude each other"
+    assert (both.code, both.errors) == (2, [told])
