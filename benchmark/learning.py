@@ -6,8 +6,9 @@
     python benchmark/learning.py --settings fast --seeds 0
     python benchmark/learning.py --collect          collect only, also of runs that still go on
 
-Four settings, each the same for all tasks: `+experiment=fast`, the same with a feasible
-wrist path, `algo=ppo_fast action=residual`, and the paper's PPO on its actions.
+Five settings, each the same for all tasks: `+experiment=fast`, the same with a wrist that is not
+planned but follows a clipped or a feasible path, `algo=ppo_fast action=residual`, and the paper's
+PPO on its actions.
 Each run is an ordinary `pgdm-run`, so that stopping and starting again goes on where it was. Two
 runs train at a time, one thread each.
 """
@@ -36,17 +37,15 @@ EARLY = 300_000
 """Frames after which the table shows success a first time."""
 
 QUICK6 = suite("quick6")
+UNPLANNED = ("action.hold_steps=0", "eval.interval_frames=50000")
 SETTINGS = {
     "fast": ("+experiment=fast", "eval.interval_frames=50000"),
-    "fast-feasible": (
-        "+experiment=fast",
-        "action.wrist_path=feasible",
-        "eval.interval_frames=50000",
-    ),
+    "fast-clipped": ("+experiment=fast", *UNPLANNED, "action.wrist_path=clipped"),
+    "fast-feasible": ("+experiment=fast", *UNPLANNED, "action.wrist_path=feasible"),
     "ppo_fast-residual": ("algo=ppo_fast", "action=residual", "eval.interval_frames=100000"),
     "ppo-absolute": ("algo=ppo", "action=absolute", "eval.interval_frames=100000"),
 }
-SEEDS = {"fast": (0, 1, 2), "fast-feasible": (0,), "ppo_fast-residual": (0,), "ppo-absolute": (0,)}
+SEEDS = {setting: (0, 1, 2) if setting == "fast" else (0,) for setting in SETTINGS}
 COMMON = ("eval.video_every_eval=false", "keep_replay=true")
 CURVES = ("success", "lifted", "return", "com_error")
 KINDS = ("eval_sampled", "eval_deterministic")
