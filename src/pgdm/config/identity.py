@@ -44,6 +44,7 @@ _BESIDE = (
 ADDED_LATER: dict[str, Any] = {
     "action.wrist_path": "carried",
     "action.hold_steps": 0,
+    "action.carry_load": False,
     "algo.learner": "ppo",
     "keep_replay": False,
     "shaping.name": "none",

@@ -92,6 +92,7 @@ class EnvBuilder:
             warm_targets(index, qpos).numpy(),
             self.motion.substeps,
             cfg.action.hold_steps,
+            cfg.action.carry_load,
         )
         self.wrist = plan(self.wrist_problem) if cfg.action.plans_wrist else None
         commands = None if self.wrist is None else torch.from_numpy(self.wrist.commands)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pgdm.errors import UnknownNameError
+from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.motion.reference import ObjectReference
 from pgdm.sim.scene import SceneIndex
 from pgdm.wrist.path import PATHS
@@ -40,6 +40,9 @@ class ActionCfg:
     hold_steps: int
     """Only ``planned``: control steps for which the hand stays at its pre-grasp, so that the
     fingers can close, and then as many to catch up."""
+
+    carry_load: bool
+    """Only ``planned``: whether the commands bear the object's weight once it is to be lifted."""
 
     @property
     def plans_wrist(self) -> bool:
@@ -102,6 +105,8 @@ def residual(
     """Return the map in which the exemplar motion moves the wrist and the policy corrects it."""
     base = absolute(cfg, index, reference, start, None)
     n = index.num_base_joints
+    if commands is None and cfg.wrist_path == PLANNED:
+        raise ConfigError("action.wrist_path=planned needs the commands of a plan")
     if commands is None:
         path, lead = PATHS[cfg.wrist_path](index, reference, start), cfg.lead_steps
     else:  # they know how the servos lag

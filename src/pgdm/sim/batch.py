@@ -54,7 +54,7 @@ class SimBatch:
         self._substeps = substeps
         threads = num_threads or len(os.sched_getaffinity(0))
         self._batch = mujoco_batch.Batch(scene.model, num_envs, threads, persistent=True)
-        fields = ("qpos", "qvel", "ctrl", "qfrc_applied", "qfrc_bias", "warning")
+        fields = ("qpos", "qvel", "ctrl", "qfrc_applied", "qfrc_bias", "xfrc_applied", "warning")
         self._f = {name: getattr(self._batch, name) for name in fields}
         derived = ("geom_xpos", "xquat", "xipos", "cvel", "subtree_com")
         self._d = {name: self._batch.bind(name) for name in derived}
@@ -146,6 +146,11 @@ class SimBatch:
     def body_pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the centre of mass (N, 3) m and orientation (N, 4) wxyz of a body, world frame."""
         return self._d["xipos"][:, body].copy(), self._d["xquat"][:, body].copy()
+
+    def push(self, body: int, force: np.ndarray, point: np.ndarray) -> None:
+        """Let forces (N, 3) N act on a body at points (N, 3) m, world frame, until a reset."""
+        arm = point - self._d["xipos"][:, body]
+        self._f["xfrc_applied"][:, body] = np.concatenate((force, np.cross(arm, force)), 1)
 
     def restore(self, rows: np.ndarray) -> None:
         """Continue from rows (N, nstate) that ``rows`` once gave, to the bit.

@@ -45,6 +45,7 @@ _STEP, _STEP_PER_S = 1e-4, 1e-3  # of finite differences, m and rad
 _POOR, _GOOD = 0.3, 0.75
 _ENOUGH = 0.01  # a stage ends with a step that lowers the cost by less than this share
 _LEAST_TRUST = 1e-3  # or with a trust region below this, m and rad
+_GRAVITY, _LIFTED_M = 9.81, 0.02
 _TINY, _SAME = 1e-9, 1e-6
 _LIMIT_ROUNDS = 6
 _STUCK = 1e3  # kg m^2
@@ -81,6 +82,9 @@ class WristProblem:
     hold_steps: int = 0
     """Control steps for which the hand stays at its start, so that the fingers can close; as many
     follow in which it may go where it likes, to catch up."""
+    carries: bool = False
+    """Whether the hand is loaded with the object's weight where the exemplar has lifted it, which
+    gravity compensation does not know of."""
 
     def check(self) -> None:
         """Check that the hand has a base that can be moved.
@@ -95,6 +99,19 @@ class WristProblem:
                 "three slides and three hinges; use action=absolute"
             )
 
+    def steps_behind(self) -> np.ndarray:
+        """Return which step of the exemplar the hand is to be at, (T,): 0 while it holds."""
+        step = np.arange(len(self.reference))
+        return np.where(step <= self.hold_steps, 0, step)
+
+    def load_n(self) -> np.ndarray:
+        """Return the weight that the hand carries at each step (T,), N; grows over 2 cm of rise."""
+        scene, height = self.scene, self.reference.pos.numpy()[self.steps_behind(), 2]
+        if not (self.carries and scene.lies_free):
+            return np.zeros(len(height))
+        mass = scene.model.body_subtreemass[scene.index.object_body]
+        return mass * _GRAVITY * ((height - height[0]) / _LIFTED_M).clip(0.0, 1.0)
+
     def key(self) -> str:
         """Return a SHA-256 over all that a plan depends on."""
         digest = hashlib.sha256(f"{VERSION} {mujoco.__version__} {self.substeps}".encode())
@@ -104,7 +121,7 @@ class WristProblem:
             scene.hand.num_wrist_joints,
             scene.index.num_compensated,
         )
-        digest.update(f"{self.hold_steps} {joints}".encode())
+        digest.update(f"{self.hold_steps} {self.carries} {joints}".encode())
         digest.update(scene.digest().encode())
         reference = self.reference.pos.numpy(), self.reference.quat.numpy()
         for array in (*reference, self.qpos, self.qvel, self.fingers):
@@ -190,6 +207,7 @@ class _Hand:
         self.sim = SimBatch(scene, 1, 1, problem.substeps)
         self._restart()
         pos, turn = self._palm(self.sim)
+        self._load = problem.load_n()
         self.start_turn = turn[0]
         self._grasp = turn[0].inv().apply(problem.reference.pos.numpy()[0] - pos[0])
 
@@ -198,8 +216,9 @@ class _Hand:
         self._restart()
         states, poses = [self.sim.read()], []
         ctrl = self._problem.fingers[None].copy()
-        for command in commands:
+        for k, command in enumerate(commands):
             ctrl[0, :_JOINTS] = command
+            self.carry(self.sim, np.array([k + 1]))
             if self.sim.step(ctrl).any():
                 task = self._problem.scene.task.id
                 raise SceneError(f"task '{task}': the simulation of the hand alone diverged")
@@ -216,6 +235,13 @@ class _Hand:
         """Return the point (N, 3) that is the object's centre at the start, and the palm's turn."""
         pos, turn = self._palm(sim)
         return pos + turn.apply(self._grasp), turn
+
+    def carry(self, sim: SimBatch, steps: np.ndarray) -> None:
+        """Load simulations with the weight that they carry at steps (N,) of the motion."""
+        if self._load.any():
+            force = np.zeros((len(steps), 3))
+            force[:, 2] = -self._load[steps]
+            sim.push(self.palm, force, self.grasp_point(sim)[0])
 
     def _palm(self, sim: SimBatch) -> tuple[np.ndarray, Rotation]:
         pos, quat = sim.body_pose(self.palm)
@@ -257,7 +283,7 @@ class _Search:
         base0 = mount * Rotation.from_euler("XYZ", problem.qpos[_SLIDES:_JOINTS])
         turns = carried * (base0.inv() * self._hands[True].start_turn)
         hold, step = problem.hold_steps, np.arange(len(self.path))
-        held = np.where(step <= hold, 0, step)[1:]
+        held = problem.steps_behind()[1:]
         self._targets, self._turns = problem.reference.pos.numpy()[held], turns[held.tolist()]
         self._followed = ((step <= hold) | (step > 2 * hold))[1:, None]
 
@@ -276,7 +302,11 @@ class _Search:
                 np.maximum(self._low - commands, -trust), np.minimum(self._high - commands, trust)
             )
             tried = (commands + step).clip(self._low, self._high)
-            tried_way = self._rollout(hand, tried)
+            try:
+                tried_way = self._rollout(hand, tried)
+            except SceneError:  # it diverged: too far
+                trust /= 4
+                continue
             gained = cost - (tried_cost := self._cost(tried, tried_way))
             share = gained / max(model.gain(step.ravel()), _TINY)  # of what the model promised
             if share < _POOR:
@@ -326,6 +356,7 @@ class _Search:
         def after() -> np.ndarray:
             self.frames += steps
             self._steps.reset(np.arange(steps), qpos, qvel)
+            self._hands[True].carry(self._steps, np.arange(1, steps + 1))
             self._steps.step(ctrl)
             state = self._steps.read()
             off = self._off(*self._hands[True].grasp_point(self._steps))
