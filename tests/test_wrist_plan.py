@@ -26,6 +26,7 @@ from pgdm.experiment import env_builder, foreseen
 from pgdm.library import open_library
 from pgdm.library.report import silent
 from pgdm.sim import gl
+from pgdm.sim.batch import SimBatch
 from pgdm.sim.scene import Scene, build_scene, hand_alone
 from pgdm.tracking.run_folder import read_json
 from pgdm.wrist import plan as planner
@@ -105,6 +106,49 @@ def test_a_hand_that_is_held_stays_and_then_catches_up(problem: WristProblem) ->
     assert away[:hold].max() < 0.01
     assert plan.error_m[:hold].max() > 0.05  # the motion goes on meanwhile
     assert plan.error_m[2 * hold :].max() < 0.01
+
+
+def test_a_load_grows_with_the_rise_after_the_hold(problem: WristProblem) -> None:
+    carrying = replace(problem, hold_steps=2, carries=True)
+    load, height = carrying.load_n(), problem.reference.pos[:, 2].numpy()
+    model, duck = problem.scene.model, problem.scene.index.object_body
+    weight = 9.81 * float(model.body_subtreemass[duck])
+    assert (load[:3] == 0).all()
+    rise = height[3:] - height[0]
+    np.testing.assert_allclose(load[3:], weight * (rise / 0.02).clip(0, 1))
+    assert load.max() == pytest.approx(weight)  # it is lifted by more than 2 cm
+    assert not replace(carrying, carries=False).load_n().any()
+
+
+def test_what_hangs_on_a_hinge_is_not_carried(library_home: Path) -> None:
+    problem = env_builder(compose(["task=door-open"]), open_library()).wrist_problem
+    assert not replace(problem, carries=True).load_n().any()
+
+
+def test_a_weight_pulls_the_base_down_as_its_spring_lets_it(problem: WristProblem) -> None:
+    # At rest slides of gain k give way to a force F by F / k.
+    sim = SimBatch(hand_alone(problem.scene), 2, 1, problem.substeps)
+    ctrl = np.tile(problem.fingers, (2, 1))
+    ctrl[:, :6] = problem.qpos[:6]
+    ctrl[:, 1] += 0.1  # up, clear of the table
+    palm = planner._Hand(problem, hand_alone(problem.scene)).palm
+    sim.reset(np.arange(2), problem.qpos, problem.qvel)
+    force = np.array([[0.0, 0, 0], [0.0, 0, -3.5]])
+    for _ in range(200):
+        sim.push(palm, force, sim.body_pose(palm)[0])
+        sim.step(ctrl)
+    slides = sim.read().qpos[:, :3].numpy()
+    stiffness = problem.scene.model.actuator_gainprm[0, 0]
+    assert np.linalg.norm(slides[1] - slides[0]) == pytest.approx(3.5 / stiffness, rel=0.02)
+
+
+def test_commands_that_bear_a_load_follow_with_it(problem: WristProblem, plan: WristPlan) -> None:
+    carrying = replace(problem, carries=True)
+    assert carrying.key() != problem.key()
+    bearing = plan_wrist(carrying, num_threads=1)
+    assert bearing.error_m.mean() < 0.002
+    # 0.29 kg at 175 N/m are 16 mm.
+    assert simulate(carrying, plan.commands).error_m.max() > 0.01
 
 
 def test_a_key_tells_all_that_a_plan_depends_on(problem: WristProblem) -> None:
