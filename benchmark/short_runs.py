@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -11,10 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pgdm.tracking.run_folder import read_json
-from pgdm.tracking.run_log import RunLog
+from pgdm.tracking.run_folder import CONFIG, RESULT, RunFolder, read_json
+from pgdm.tracking.run_log import FILE_NAME, RunLog, metrics_of
 
 AT_A_TIME = 2
+TRAIN_POINTS = 40
+TRAINED = ("train/return", "train/success", "train/lifted")
 
 
 @dataclass(frozen=True)
@@ -82,3 +86,24 @@ def curves(run: Path, kind: str, names: Sequence[str]) -> dict[str, list[float |
         values = [float(line.get(name, math.nan)) for line in lines]
         found[name] = [None if math.isnan(v) else round(v, 5) for v in values]
     return found
+
+
+def store(found: RunFolder, target: Path, results: Path) -> None:
+    """Keep what a report needs of a run, its training curve thinned, in a folder of results."""
+    target.mkdir(parents=True, exist_ok=True)
+    where = f"run_dir: {target.relative_to(results)}"  # not a path of the machine it ran on
+    config = (found.path / CONFIG).read_text(encoding="utf-8")
+    config = re.sub(r"^run_dir: .*$", where, config, flags=re.MULTILINE)
+    (target / CONFIG).write_text(config, encoding="utf-8")
+    (target / RESULT).write_text(json.dumps({**found.result, "video": None}, indent=1) + "\n")
+    (target / FILE_NAME).unlink(missing_ok=True)
+    log = RunLog(target / FILE_NAME)
+    for record in found.log.thinned(TRAIN_POINTS):
+        metrics, kind = metrics_of(record), str(record["kind"])
+        log.append(
+            {k: v for k, v in metrics.items() if kind == "eval" or k in TRAINED},
+            frames=int(record["frames"]),
+            iteration=int(record["iteration"]),
+            time_s=float(record["time_s"]),
+            kind=kind,
+        )

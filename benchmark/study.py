@@ -15,25 +15,22 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from short_runs import store
 
 from pgdm.config.suites import suite
-from pgdm.tracking.run_folder import CONFIG, RESULT, RunFolder, find_runs
-from pgdm.tracking.run_log import FILE_NAME, RunLog, metrics_of
+from pgdm.tracking.run_folder import RESULT, find_runs
 
 RESULTS = Path(__file__).parent / "results" / "study"
 PICTURE = Path(__file__).parent.parent / "docs" / "images" / "study.png"
 FRAMES = 500_000
 # The curriculum's 4M frames of the paper's 50M, as the same share of these.
 RAMP = f"method.curriculum.ramp_frames={4_000_000 * FRAMES // 50_000_000}"
-TRAIN_POINTS = 40
-TRAINED = ("train/return", "train/success", "train/lifted")
 
 TASKS = suite("quick6")
 EXPERTS = [task for task in TASKS if task in suite("adroit_experts")]
@@ -86,29 +83,8 @@ def run(setting: str, folder: Path) -> int:
     code = subprocess.run(command).returncode
     for found in find_runs(folder / setting / "runs"):
         if found.status() == "finished":
-            store(found, place(setting, found.config["task"]["id"]))
+            store(found, place(setting, found.config["task"]["id"]), RESULTS)
     return code
-
-
-def store(found: RunFolder, target: Path) -> None:
-    """Keep what a report needs of a run."""
-    target.mkdir(parents=True, exist_ok=True)
-    where = f"run_dir: {target.relative_to(RESULTS)}"  # not a path of the machine it ran on
-    config = (found.path / CONFIG).read_text(encoding="utf-8")
-    config = re.sub(r"^run_dir: .*$", where, config, flags=re.MULTILINE)
-    (target / CONFIG).write_text(config, encoding="utf-8")
-    (target / RESULT).write_text(json.dumps({**found.result, "video": None}, indent=1) + "\n")
-    (target / FILE_NAME).unlink(missing_ok=True)
-    log = RunLog(target / FILE_NAME)
-    for record in found.log.thinned(TRAIN_POINTS):
-        metrics, kind = metrics_of(record), str(record["kind"])
-        log.append(
-            {k: v for k, v in metrics.items() if kind == "eval" or k in TRAINED},
-            frames=int(record["frames"]),
-            iteration=int(record["iteration"]),
-            time_s=float(record["time_s"]),
-            kind=kind,
-        )
 
 
 def figures() -> Rows:

@@ -1,0 +1,101 @@
+"""All 50 tasks of the benchmark with the recommended settings; stores runs and page.
+
+    pgdm-run -m +experiment=fast task=tcdm50 seed=0 sweep.name=tcdm50      train (10 to 20 hours)
+    python benchmark/tcdm50.py runs/sweeps/tcdm50      store what has finished by now, and report
+
+Training and storing are apart, so that results are stored while a sweep goes on. Finished runs of
+`+experiment=fast` are taken from any folders that are given, whatever else is in them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+from short_runs import store
+
+from pgdm.config.identity import identity_hash
+from pgdm.config.saved import load_config
+from pgdm.config.store import compose
+from pgdm.config.suites import suite
+from pgdm.tracking.run_folder import RESULT, WRIST_BOUND, RunFolder, find_runs, read_json
+
+RESULTS = Path(__file__).parent / "results" / "tcdm50"
+TASKS = suite("tcdm50")
+
+
+def place(task: str, seed: int) -> Path:
+    """Return the folder of a stored run."""
+    return RESULTS / "runs" / f"{task}-s{seed}"
+
+
+def wanted(found: RunFolder) -> bool:
+    """Return whether a run has finished, has the settings, and more frames than a stored one."""
+    task = found.config.get("task", {}).get("id")
+    if found.status() != "finished" or task not in TASKS:
+        return False
+    cfg = load_config(found.path)
+    same = [f"task={task}", f"seed={cfg.seed}", f"total_frames={cfg.total_frames}"]
+    if identity_hash(cfg) != identity_hash(compose(["+experiment=fast", *same])):
+        return False
+    before = place(task, cfg.seed) / RESULT
+    return not before.is_file() or read_json(before)["frames"] < found.result["frames"]
+
+
+def table(rows: dict[Path, dict[str, Any]]) -> str:
+    """Return stored results as a Markdown table, worst first."""
+    lines = [
+        "| task | seed | frames | minutes | success, sampled | deterministic | lifted | bound "
+        "| paper |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
+    ]
+    for folder, row in sorted(rows.items(), key=lambda r: r[1]["metrics"]["eval_sampled/success"]):
+        cfg, metrics = load_config(folder), row["metrics"]
+        cells = [
+            metrics.get(f"eval_{kind}") for kind in ("sampled/success", "deterministic/success")
+        ]
+        cells += [metrics.get("eval_sampled/lifted"), row.get(WRIST_BOUND), cfg.task.paper_success]
+        shown = " | ".join("-" if value is None else f"{value:.1%}" for value in cells)
+        lines.append(
+            f"| {cfg.task.id} | {cfg.seed} | {row['frames']:,} | {row['wall_time_s'] / 60:.0f} "
+            f"| {shown} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Store what has finished, then report."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folders", nargs="*", type=Path, help="where runs are, at any depth")
+    for folder in parser.parse_args().folders:
+        for found in find_runs(folder):
+            if wanted(found):
+                target = place(found.config["task"]["id"], int(found.config["seed"]))
+                store(found, target, RESULTS)
+                print(f"stored {target.name}", flush=True)
+    files = sorted((RESULTS / "runs").glob(f"*/{RESULT}"))
+    rows = {file.parent: read_json(file) for file in files}
+    tasks = {load_config(folder).task.id for folder in rows}
+    told = f"{len(tasks)} of {len(TASKS)} tasks, {len(rows)} runs"
+    if rows:
+        success = mean(row["metrics"]["eval_sampled/success"] for row in rows.values())
+        told += f", mean sampled success {success:.1%}"
+        (RESULTS / "README.md").write_text(
+            f"# {told}\n\n`+experiment=fast`; not comparable with the paper (50,000,000 "
+            "frames, 3 seeds). Bound: success of the hand alone on its planned way. "
+            f"Page, curves and tables are in `report`.\n\n{table(rows)}"
+        )
+        pgdm = str(Path(sys.executable).with_name("pgdm"))
+        # From there, as the page names the folders that it was given.
+        subprocess.run([pgdm, "report", "runs", "--out", "report"], cwd=RESULTS, check=True)
+    print(told)
+
+
+if __name__ == "__main__":
+    main()
