@@ -77,11 +77,13 @@ EXPERIMENTS = (
         "",
     ),
     Experiment(
-        "path-outside",
-        "a path that leaves the base's range cannot be corrected",
-        ("action.wrist_path=carried",),
-        "yes: path within limits",
+        "unplanned",
+        "a path sent as it is is followed late and with a swing",
+        ("action.wrist_path=clipped",),
+        "yes: planned",
     ),
+    Experiment("no-hold", "fingers need time to close", ("action.hold_steps=0",), "yes: held"),
+    Experiment("no-load", "weight pulls the base down", ("action.carry_load=false",), "yes: borne"),
     Experiment(
         "cool",
         "a tenth of the entropy's weight at the start finds contact sooner",
