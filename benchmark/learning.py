@@ -37,11 +37,11 @@ EARLY = 300_000
 """Frames after which the table shows success a first time."""
 
 QUICK6 = suite("quick6")
-UNPLANNED = ("action.hold_steps=0", "eval.interval_frames=50000")
+FAST = ("+experiment=fast", "eval.interval_frames=50000")
 SETTINGS = {
-    "fast": ("+experiment=fast", "eval.interval_frames=50000"),
-    "fast-clipped": ("+experiment=fast", *UNPLANNED, "action.wrist_path=clipped"),
-    "fast-feasible": ("+experiment=fast", *UNPLANNED, "action.wrist_path=feasible"),
+    "fast": FAST,
+    "fast-clipped": (*FAST, "action.wrist_path=clipped"),
+    "fast-feasible": (*FAST, "action.wrist_path=feasible"),
     "ppo_fast-residual": ("algo=ppo_fast", "action=residual", "eval.interval_frames=100000"),
     "ppo-absolute": ("algo=ppo", "action=absolute", "eval.interval_frames=100000"),
 }

@@ -34,13 +34,13 @@ def place(task: str, seed: int) -> Path:
 
 
 def wanted(found: RunFolder) -> bool:
-    """Return whether a run has finished, has the settings, and more frames than a stored one."""
+    """Return whether a run has finished with these settings, longer than what is stored of it."""
     task = found.config.get("task", {}).get("id")
     if found.status() != "finished" or task not in TASKS:
         return False
     cfg = load_config(found.path)
-    same = [f"task={task}", f"seed={cfg.seed}", f"total_frames={cfg.total_frames}"]
-    if identity_hash(cfg) != identity_hash(compose(["+experiment=fast", *same])):
+    fast = compose(["+experiment=fast", f"task={task}", f"seed={cfg.seed}"])
+    if identity_hash(cfg) != identity_hash(fast) or found.result["frames"] < fast.total_frames:
         return False
     before = place(task, cfg.seed) / RESULT
     return not before.is_file() or read_json(before)["frames"] < found.result["frames"]

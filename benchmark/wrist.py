@@ -1,4 +1,4 @@
-"""How near the wrist's prior brings the hand to each motion: geometry, and the hand alone.
+"""How closely the hand can follow each motion: by geometry, and simulated without the object.
 
     python benchmark/wrist.py                plan what is missing of all 51 tasks, print the table
     python benchmark/wrist.py quick6         of a suite
@@ -30,6 +30,12 @@ from pgdm.wrist.plan import WristPlan
 
 RESULTS = Path(__file__).parent / "results" / "wrist.json"
 TASKS = (*suite("tcdm50"), "dmanus-sim2real")
+
+
+def key(task: str) -> str:
+    """Return what a row depends on, as a hash."""
+    cfg = compose([f"task={task}", "+experiment=fast", "action.wrist_path=clipped"])
+    return env_builder(cfg, assets(cfg, print), print).wrist_problem.key()
 
 
 def measure(task: str) -> dict[str, Any]:
@@ -97,14 +103,14 @@ def table(stored: dict[str, Any]) -> str:
 
 def main() -> None:
     """Plan what is missing, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("suite", nargs="?", help="suite to plan [all 51 tasks]")
     parser.add_argument("--table", action="store_true", help="only print what is stored")
     args = parser.parse_args()
     stored = read_json(RESULTS) if RESULTS.is_file() else {}
     for task in () if args.table else suite(args.suite) if args.suite else TASKS:
-        if task not in stored:
-            stored[task] = measure(task)
+        if stored.get(task, {}).get("key") != key(task):
+            stored[task] = {"key": key(task), **measure(task)}
             print(task, json.dumps(stored[task]), flush=True)
             write_json(RESULTS, stored)
     print(table(stored))

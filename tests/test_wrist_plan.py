@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 import time
 from collections.abc import Callable
@@ -18,13 +19,13 @@ from pgdm.config.store import compose
 from pgdm.errors import (
     ConfigError,
     CorruptAssetError,
-    LibraryError,
     PlanMissingError,
     RenderError,
 )
 from pgdm.experiment import env_builder, foreseen
 from pgdm.library import open_library
 from pgdm.library.report import silent
+from pgdm.motion.reference import ObjectReference
 from pgdm.sim import gl
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.scene import Scene, build_scene, hand_alone
@@ -200,14 +201,34 @@ def test_a_model_with_limits_finds_its_least(seed: int) -> None:
     assert cost(step) == pytest.approx(known.fun, rel=1e-3)
 
 
-def test_a_hand_without_six_base_joints_is_refused(problem: WristProblem) -> None:
-    hand = replace(problem.scene.hand, num_base_joints=3)
-    other = replace(problem, scene=replace(problem.scene, hand=hand))
-    with pytest.raises(ConfigError, match=r"^hand 'adroit' has 3 base joints; .*absolute$"):
-        plan_wrist(other)
-    # Also where nothing is to be made: it never will be.
-    with pytest.raises(ConfigError, match="3 base joints"):
-        WristPlans(Path("nowhere"), None, print, progress=None)(other)
+def test_a_hold_that_leaves_no_time_is_refused(problem: WristProblem) -> None:
+    replace(problem, hold_steps=9).check()
+    with pytest.raises(ConfigError, match=r"hold_steps is 10: .* 20 steps; use at most 9$"):
+        plan_wrist(replace(problem, hold_steps=10))
+
+
+def test_a_motion_that_would_take_hours_is_refused(problem: WristProblem) -> None:
+    reference = problem.reference
+    long = ObjectReference(reference.pos.repeat(13, 1), reference.quat.repeat(13, 1))
+    with pytest.raises(ConfigError, match=r"273 poses.*wrist_path=feasible$"):
+        plan_wrist(replace(problem, reference=long))
+
+
+def test_objects_stay_where_they_are_in_what_is_shown(
+    problem: WristProblem, plan: WristPlan
+) -> None:
+    hand = problem.scene.model.nu
+    assert (plan.qpos[:, hand:] == problem.qpos[hand:]).all()
+
+
+def test_a_base_with_a_narrow_or_no_range_has_limits_in_order(problem: WristProblem) -> None:
+    model = copy.deepcopy(problem.scene.model)
+    model.jnt_range[3] = problem.qpos[3] + np.array([-0.02, 0.02])
+    model.jnt_limited[0] = 0
+    narrow = replace(problem, scene=replace(problem.scene, model=model))
+    limits = planner._Search(narrow, 1, None)._limits
+    assert limits.low[3] < limits.high[3]
+    assert limits.low[0] == -np.inf and limits.high[0] == np.inf
 
 
 def test_only_residual_actions_plan_the_wrist() -> None:
@@ -336,7 +357,7 @@ def test_the_plan_of_another_problem_is_refused(
 ) -> None:
     path = path_of(tmp_path, problem)
     write(path, plan, replace(problem, hold_steps=3))
-    with pytest.raises(CorruptAssetError, match=r"the plan of another task, hand or start$"):
+    with pytest.raises(CorruptAssetError, match=r"another version of planner or MuJoCo$"):
         read(path, problem)
 
 
@@ -377,8 +398,8 @@ def test_a_plan_is_made_once_and_told(
     assert first.sha256() == second.sha256()
     assert progress == [("wrist plan", 1, 1)]
     begun, finished = told
-    assert begun == f"the wrist of '{TASK}' is not planned yet: doing it once"
-    assert finished.startswith(str(path_of(tmp_path, problem)))
+    assert begun.startswith(f"computing the wrist plan of '{TASK}'")
+    assert path_of(tmp_path, problem).is_file()
     assert "within 1 cm in 100% of the steps" in finished
 
 
@@ -399,7 +420,7 @@ def test_a_plan_that_may_not_be_made_is_missed(
     problem: WristProblem, counted: Counted, tmp_path: Path
 ) -> None:
     plans = WristPlans(tmp_path / "library", None, print, progress=None)
-    with pytest.raises(PlanMissingError, match=f"^the wrist of '{TASK}' is planned first$"):
+    with pytest.raises(PlanMissingError, match=f"^no wrist plan of '{TASK}' is stored yet"):
         plans(problem)
     assert counted.calls == 0
     assert list(tmp_path.iterdir()) == []
@@ -441,13 +462,27 @@ def test_two_at_once_plan_once(
 
 
 @pytest.mark.parametrize("place", ["library", "library/wrist"])
-def test_a_library_that_cannot_be_written_is_an_error(
+def test_where_the_library_cannot_be_written_the_run_plans_for_itself(
     place: str, problem: WristProblem, counted: Counted, tmp_path: Path
 ) -> None:
     (tmp_path / place).parent.mkdir(exist_ok=True)
     (tmp_path / place).write_text("a file in the folder's place")
-    with pytest.raises(LibraryError, match=r"library.*: cannot be written \(.*\)$"):
-        WristPlans(tmp_path / "library", None, print, silent)(problem)
+    told: list[str] = []
+    plan = WristPlans(tmp_path / "library", None, told.append, silent)(problem)
+    assert plan.sha256() == counted._plan.sha256() and counted.calls == 1
+    assert any("cannot be written" in text and "with the run alone" in text for text in told)
+
+
+def test_a_runs_own_plan_serves_with_later_versions(
+    problem: WristProblem, counted: Counted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = replace(counted._plan, commands=counted._plan.commands + 1e-9)
+    write(tmp_path / "run" / FILE, own, problem)
+    monkeypatch.setattr(planner, "VERSION", planner.VERSION + 1)
+    plans = WristPlans(tmp_path / "library", tmp_path / "run", print, silent)
+    assert plans(problem).sha256() == own.sha256()
+    elsewhere = replace(problem, qpos=problem.qpos + 1e-3)
+    assert plans(elsewhere).sha256() == counted._plan.sha256()  # not the run's: another start
 
 
 def test_a_plan_that_is_stopped_leaves_nothing(problem: WristProblem, tmp_path: Path) -> None:
@@ -462,8 +497,12 @@ def test_a_plan_that_is_stopped_leaves_nothing(problem: WristProblem, tmp_path: 
 # Who uses it
 
 
+AT_ONCE = "+experiment=fast", "action.hold_steps=0", "action.carry_load=false"
+"""As ``problem``: without hold and load."""
+
+
 def fast_run(*arguments: str) -> Outcome:
-    chosen = "+experiment=fast", f"task={TASK}", "keep_replay=true", "run_dir=run"
+    chosen = *AT_ONCE, f"task={TASK}", "keep_replay=true", "run_dir=run"
     return command("pgdm-run", "--offline", *TINY_SAC, *chosen, *arguments)
 
 
@@ -473,7 +512,7 @@ def test_a_run_keeps_its_plan_and_goes_on_with_it(
     run = tmp_path / "run"
     first = fast_run()
     assert (first.code, first.errors) == (0, [])
-    assert "is not planned yet: doing it once" in " ".join(first.err.split())
+    assert "computing the wrist plan of" in " ".join(first.err.split())
     assert read_json(run / "result.json")["wrist_sha256"] == plan.sha256()
     (kept,) = (own_library / "wrist").iterdir()
     assert (run / FILE).is_file()
@@ -492,9 +531,9 @@ def test_a_run_keeps_its_plan_and_goes_on_with_it(
 def test_a_run_says_beforehand_that_its_wrist_is_planned_first(
     own_library: Path, problem: WristProblem, plan: WristPlan
 ) -> None:
-    cfg = compose(["+experiment=fast", f"task={TASK}", "run_dir=run"])
+    cfg = compose([*AT_ONCE, f"task={TASK}", "run_dir=run"])
     missing, *others = foreseen(cfg, open_library())
-    assert missing == f"the wrist of '{TASK}' is planned first"
+    assert missing.startswith(f"no wrist plan of '{TASK}' is stored yet")
     assert any("the replay takes" in note for note in others)
     assert not (own_library / "wrist").exists()
     dry = fast_run("--dry-run")
@@ -514,7 +553,7 @@ def test_a_plan_is_filmed(
     film = tmp_path / "wrist.mp4"
     done = command("pgdm", "view", TASK, "--wrist", "--video", str(film), "--offline")
     assert (done.code, done.errors) == (0, [])
-    assert "within 1 cm in 100% of the steps" in " ".join(done.out.split())
+    assert "within 1 cm in 75% of the steps" in " ".join(done.out.split())
     assert film.stat().st_size > 10_000
 
 

@@ -56,6 +56,9 @@ ADDED_LATER: dict[str, Any] = {
 }
 
 
+_ONLY_PLANNED = ("action.hold_steps", "action.carry_load")  # they act where the wrist is planned
+
+
 def with_added_keys(plain: Mapping[str, Any]) -> dict[str, Any]:
     """Return a stored configuration with the keys that it is too old to have."""
     result = dict(plain)
@@ -75,10 +78,11 @@ def identity(cfg: ExperimentCfg) -> dict[str, Any]:
     folder and sweep job that it had before there was the key.
     """
     flat = flatten(dataclasses.asdict(cfg))
+    idle = () if cfg.action.plans_wrist else _ONLY_PLANNED
     return {
         k: v
         for k, v in flat.items()
-        if changes_result(k) and not (k in ADDED_LATER and v == ADDED_LATER[k])
+        if changes_result(k) and k not in idle and not (k in ADDED_LATER and v == ADDED_LATER[k])
     }
 
 

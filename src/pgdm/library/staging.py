@@ -11,7 +11,8 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -34,6 +35,7 @@ SOURCES = (OWN, *WHOLE, ANIMATED)
 EXPERTS = "experts"
 """Folder of the expert hand trajectories, which belong to no source: they fit either one's."""
 
+_MAKING_TIMEOUT_S = 3600.0
 _STAGING = ".staging-"
 _PREVIOUS = ".previous-"
 _log = logging.getLogger(__name__)
@@ -69,6 +71,36 @@ def locked(root: Path, timeout_s: float = 3600.0) -> Iterator[None]:
         ) from error
     except OSError as error:
         raise LibraryError(f"{root}: cannot be written ({error.strerror or error})") from error
+
+
+@contextmanager
+def making(path: Path, notify: Callable[[str], None]) -> Iterator[None]:
+    """Hold the lock of one file that is being made; others wait for it.
+
+    Raises:
+        LibraryError: the folder cannot be written, or another process holds it too long.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(str(path.with_name(f".{path.stem}.lock")))
+        try:
+            lock.acquire(timeout=0.2)
+        except Timeout:
+            begun = time.monotonic()
+            notify(f"another process is making {path}: waiting for it")
+            lock.acquire(timeout=_MAKING_TIMEOUT_S)
+            _log.info("waited %.0f s for %s", time.monotonic() - begun, path)
+    except Timeout as error:
+        raise LibraryError(
+            f"{path}: another process has been making it for {_MAKING_TIMEOUT_S:.0f} s; wait for "
+            "it or end it"
+        ) from error
+    except OSError as error:
+        raise LibraryError(f"{path}: cannot be written ({error.strerror or error})") from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 @contextmanager

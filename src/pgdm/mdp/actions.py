@@ -42,7 +42,8 @@ class ActionCfg:
     fingers can close, and then as many to catch up."""
 
     carry_load: bool
-    """Only ``planned``: whether the commands bear the object's weight once it is to be lifted."""
+    """Only ``planned``: whether the commands compensate for the object's weight from when the
+    exemplar lifts it."""
 
     @property
     def plans_wrist(self) -> bool:

@@ -8,16 +8,13 @@ has trained a predictor for the hand.
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from pgdm.errors import LibraryError, UnknownNameError
-from pgdm.library import Library, Motion, ensure_expert, pregrasp_file, rebuild
+from pgdm.library import Library, Motion, ensure_expert, pregrasp_file, rebuild, staging
 from pgdm.library.pregrasp_file import Pregrasp
 from pgdm.library.report import Progress, silent
 from pgdm.pregrasp.mocap import Retargeted, check, of_task, retarget
@@ -35,8 +32,6 @@ from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
 
 Notify = Callable[[str], None]
 
-LOCK_TIMEOUT_S = 3600.0
-"""How long to wait for another process that makes the same start."""
 DEEPER_M = 0.001
 """A plan that ends deeper in something than this is not taken."""
 FARTHEST = 3.0
@@ -108,7 +103,7 @@ def ensure_start(
     motion = library.motion(wanted.task.motion)
     if not wanted.is_other_hand and wanted.source in motion.starts:
         return
-    with _locked(wanted.path, notify):
+    with staging.making(wanted.path, notify):
         if wanted.path.is_file():  # another process was first
             return
         way = "a prediction" if wanted.source == "learned" else "inverse kinematics"
@@ -215,32 +210,3 @@ def _figures(plan: ReachPlan) -> dict[str, float | bool]:
         "object_moved_mm": round(1e3 * plan.object_moved_m, 2),
         "depth_mm": round(1e3 * plan.depth_m, 2),
     }
-
-
-@contextmanager
-def _locked(path: Path, notify: Notify) -> Iterator[None]:
-    """Hold the lock of one start.
-
-    Raises:
-        LibraryError: the folder cannot be written, or another process holds it too long.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(str(path.with_name(f".{path.stem}.lock")))
-        try:
-            lock.acquire(timeout=0.2)
-        except Timeout:
-            begun = time.monotonic()
-            notify(f"another process is making {path}: waiting for it")
-            lock.acquire(timeout=LOCK_TIMEOUT_S)
-            _log.info("waited %.0f s for %s", time.monotonic() - begun, path)
-    except Timeout as error:
-        raise LibraryError(
-            f"{path}: another process has been making it for {LOCK_TIMEOUT_S:.0f} s; wait or end it"
-        ) from error
-    except OSError as error:
-        raise LibraryError(f"{path}: cannot be written ({error.strerror or error})") from error
-    try:
-        yield
-    finally:
-        lock.release()

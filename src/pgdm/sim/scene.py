@@ -208,8 +208,8 @@ def hand_alone(scene: Scene) -> Scene:
     bodies = [model.body(i).name.startswith(scene.object_prefixes) for i in range(model.nbody)]
     of_object = np.array(bodies)[model.geom_bodyid]
     model.geom_contype[of_object] = model.geom_conaffinity[of_object] = 0
-    # Pairs that a model names collide whatever their types: they push at no depth that occurs. The
-    # gap has them found as before, since some shapes take a margin below 0 for depth.
+    # Explicit contact pairs ignore contype: at a margin of -10 m they never produce force. The gap
+    # keeps them detected as before, since for some shapes MuJoCo takes a negative margin as depth.
     named = of_object[model.pair_geom1] | of_object[model.pair_geom2]
     model.pair_margin[named], model.pair_gap[named] = -_NEVER_M, _NEVER_M
     return replace(scene, model=model)

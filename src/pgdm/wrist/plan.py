@@ -1,7 +1,7 @@
 """Commands of the wrist with which the hand alone follows an exemplar, optimised on the simulator.
 
-The base's servos are soft and underdamped, so that a path sent to them as it is is followed late
-and with a swing of centimetres. Here the commands of all control steps are found together:
+The base's servos are soft and underdamped: a path sent to them unmodified is tracked late and
+overshoots by centimetres. Here the commands of all control steps are found together:
 Gauss-Newton on the simulated hand, each step a quadratic program within the control ranges and a
 trust region.
 """
@@ -27,14 +27,14 @@ from pgdm.sim.scene import Scene, hand_alone
 from pgdm.wrist.path import feasible_path
 
 VERSION = 1
-"""Of the planner: stored plans of another are made anew."""
+"""Of the planner; plans in the library that another version stored are computed anew."""
 NEAR_M = 0.01
 """Error within which a step counts as followed, as in the benchmark's success."""
 
 _SLIDES, _JOINTS = 3, 6  # the base: slides, then hinges
 
-# Residuals are of one size where the errors are as bad: a grasp point 1 cm off, a hand turned by
-# 1.1 rad, a joint 3 mm or 0.01 rad too near its limit.
+# Scales chosen so that these errors cost the same: a grasp point 1 cm off, a palm turned by 1.1
+# rad, a joint 3 mm or 0.01 rad inside its margin.
 _PER_M, _PER_RAD = 100.0, 0.9
 _PER_LIMIT = np.repeat((300.0, 90.0), _SLIDES)
 _MARGIN = np.repeat((0.005, 0.03), _SLIDES)  # m and rad that joints keep from their limits
@@ -45,10 +45,11 @@ _STEP, _STEP_PER_S = 1e-4, 1e-3  # of finite differences, m and rad
 _POOR, _GOOD = 0.3, 0.75
 _ENOUGH = 0.01  # a stage ends with a step that lowers the cost by less than this share
 _LEAST_TRUST = 1e-3  # or with a trust region below this, m and rad
-_GRAVITY, _LIFTED_M = 9.81, 0.02
+_LIFTED_M = 0.02
 _TINY, _SAME = 1e-9, 1e-6
 _LIMIT_ROUNDS = 6
-_STUCK = 1e3  # kg m^2
+_FROZEN = 1e3  # armature with which a finger keeps its place, kg m^2
+_LONGEST = 250  # poses: the quadratic program's time grows with the third power
 _SMOOTH = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
 
 
@@ -62,7 +63,7 @@ class Stage:
 
 
 SMOOTH_STAGE, REAL_STAGE = Stage(15, 0.3), Stage(8, 0.03)
-"""First without limits and contacts, whose kinks hide the way; then with them."""
+"""First without limits and contacts, whose discontinuities mislead the search; then with them."""
 
 Progress = Callable[[int, int], None]
 """Told rounds done and rounds at most."""
@@ -83,20 +84,25 @@ class WristProblem:
     """Control steps for which the hand stays at its start, so that the fingers can close; as many
     follow in which it may go where it likes, to catch up."""
     carries: bool = False
-    """Whether the hand is loaded with the object's weight where the exemplar has lifted it, which
-    gravity compensation does not know of."""
+    """Whether the hand is loaded with the object's weight from when the exemplar lifts it: gravity
+    compensation covers the hand only."""
 
     def check(self) -> None:
-        """Check that the hand has a base that can be moved.
+        """Check that the motion leaves time to follow it, and can be planned in reasonable time.
 
         Raises:
             ConfigError: if not.
         """
-        hand = self.scene.hand
-        if hand.num_base_joints != _JOINTS:
+        poses = len(self.reference)
+        if 2 * self.hold_steps >= poses - 1:
             raise ConfigError(
-                f"hand '{hand.name}' has {hand.num_base_joints} base joints; a planned wrist needs "
-                "three slides and three hinges; use action=absolute"
+                f"action.hold_steps is {self.hold_steps}: to hold and catch up takes twice that, "
+                f"and the motion has {poses - 1} steps; use at most {(poses - 2) // 2}"
+            )
+        if poses > _LONGEST:
+            raise ConfigError(
+                f"the motion has {poses} poses, and a wrist is planned for at most {_LONGEST}; use "
+                "action.wrist_path=feasible"
             )
 
     def steps_behind(self) -> np.ndarray:
@@ -105,26 +111,28 @@ class WristProblem:
         return np.where(step <= self.hold_steps, 0, step)
 
     def load_n(self) -> np.ndarray:
-        """Return the weight that the hand carries at each step (T,), N; grows over 2 cm of rise."""
+        """Return the object's weight at each step (T,) N, ramped up over its first 2 cm of rise."""
         scene, height = self.scene, self.reference.pos.numpy()[self.steps_behind(), 2]
         if not (self.carries and scene.lies_free):
             return np.zeros(len(height))
-        mass = scene.model.body_subtreemass[scene.index.object_body]
-        return mass * _GRAVITY * ((height - height[0]) / _LIFTED_M).clip(0.0, 1.0)
+        # The tracked body may be a part of the object.
+        root = scene.model.body_rootid[scene.index.object_body]
+        weight = scene.model.body_subtreemass[root] * -scene.model.opt.gravity[2]
+        return weight * ((height - height[0]) / _LIFTED_M).clip(0.0, 1.0)
 
     def key(self) -> str:
-        """Return a SHA-256 over all that a plan depends on."""
-        digest = hashlib.sha256(f"{VERSION} {mujoco.__version__} {self.substeps}".encode())
+        """Return a SHA-256 over all that a plan depends on, the whole compiled model with it."""
         scene = self.scene
-        joints = (
-            scene.hand.num_base_joints,
-            scene.hand.num_wrist_joints,
-            scene.index.num_compensated,
+        model = np.empty(mujoco.mj_sizeModel(scene.model), np.uint8)
+        mujoco.mj_saveModel(scene.model, None, model)
+        numbers = (
+            *(VERSION, self.substeps, self.hold_steps, scene.hand.num_wrist_joints),
+            *(scene.index.num_compensated, scene.object_prefixes),
         )
-        digest.update(f"{self.hold_steps} {self.carries} {joints}".encode())
-        digest.update(scene.digest().encode())
+        digest = hashlib.sha256(f"{mujoco.__version__} {numbers}".encode())
         reference = self.reference.pos.numpy(), self.reference.quat.numpy()
-        for array in (*reference, self.qpos, self.qvel, self.fingers):
+        start = self.qpos, self.qvel, self.fingers
+        for array in (model, *reference, *start, self.load_n()):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
@@ -136,7 +144,7 @@ class WristPlan:
     commands: np.ndarray
     """Targets of the base joints at control steps 0..T-2, (T-1, 6) m, rad."""
     qpos: np.ndarray
-    """The scene at steps 0..T-1, (T, nq); the object is out of contact."""
+    """The scene at steps 0..T-1, (T, nq); objects stay where they are at the start."""
     error_m: np.ndarray
     """Distance of the grasp point from its target after each step, (T-1,) m."""
     frames: int = 0
@@ -168,7 +176,7 @@ def plan_wrist(
         progress: told how far the search is.
 
     Raises:
-        ConfigError: if the hand's base is not three slides and three hinges.
+        ConfigError: if the motion is too short for the hold, or too long to plan.
         SceneError: if the simulation of the hand diverges.
     """
     problem.check()
@@ -185,7 +193,9 @@ def simulate(problem: WristProblem, commands: np.ndarray) -> WristPlan:
     hand = _Hand(problem, hand_alone(problem.scene))
     way = hand.rollout(commands)
     errors = np.linalg.norm(way.points - problem.reference.pos.numpy()[1:], axis=1)
-    return WristPlan(commands, way.qpos, errors)
+    qpos, fingers_end = way.qpos.copy(), problem.scene.model.nu
+    qpos[:, fingers_end:] = problem.qpos[fingers_end:]  # they fell: nothing holds them
+    return WristPlan(commands, qpos, errors)
 
 
 @dataclass(frozen=True)
@@ -257,23 +267,24 @@ class _Search:
     def __init__(self, problem: WristProblem, num_threads: int, progress: Progress | None) -> None:
         scene, self._problem = problem.scene, problem
         self._progress, self._rounds, self.frames = progress, 0, 0
-        low, high = scene.model.jnt_range[:_JOINTS].T
-        index = scene.index
+        model, index = scene.model, scene.index
+        ranges = np.where(model.jnt_limited[:, None], model.jnt_range, (-np.inf, np.inf))[:_JOINTS]
+        margin = np.minimum(_MARGIN, np.ptp(ranges, axis=1) / 4)
         self._low, self._high = index.ctrl_low[:_JOINTS], index.ctrl_high[:_JOINTS]
-        self._limits = _Limits(low + _MARGIN, high - _MARGIN)
+        self._limits = _Limits(ranges[:, 0] + margin, ranges[:, 1] - margin)
         within = replace(
             index,
             ctrl_low=np.maximum(self._low, self._limits.low),
             ctrl_high=np.minimum(self._high, self._limits.high),
         )
         self.path = feasible_path(within, problem.reference, torch.from_numpy(problem.qpos)).numpy()
-        # Joints whose motion the base feels, and is felt by: its own and those that turn the palm.
+        # Joints dynamically coupled to the base: its own, and those that rotate the palm.
         self._n = scene.hand.num_base_joints + scene.hand.num_wrist_joints
         alone = hand_alone(scene)
         model = copy.deepcopy(alone.model)
         model.opt.disableflags |= _SMOOTH
-        # Fingers that swing freely past their limits would be kinks of another kind.
-        model.dof_armature[self._n : model.nu] = _STUCK
+        # Without limits the fingers would swing past them, so they are frozen.
+        model.dof_armature[self._n : model.nu] = _FROZEN
         smooth = replace(alone, model=model)
         self._hands = {True: _Hand(problem, alone), False: _Hand(problem, smooth)}
         self._steps = SimBatch(smooth, len(self.path) - 1, num_threads, problem.substeps)
@@ -357,7 +368,8 @@ class _Search:
             self.frames += steps
             self._steps.reset(np.arange(steps), qpos, qvel)
             self._hands[True].carry(self._steps, np.arange(1, steps + 1))
-            self._steps.step(ctrl)
+            if self._steps.step(ctrl).any():
+                raise SceneError("the simulation of the hand alone diverged")
             state = self._steps.read()
             off = self._off(*self._hands[True].grasp_point(self._steps))
             return np.concatenate((state.qpos[:, :n], state.qvel[:, :n], off), 1)

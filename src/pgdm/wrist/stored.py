@@ -55,38 +55,51 @@ class WristPlans:
         """Return a problem's plan.
 
         Raises:
-            ConfigError: the hand's base cannot follow a plan.
+            ConfigError: the motion is too short for the hold, or too long to plan.
             PlanMissingError: it is not there, and is not to be made.
-            LibraryError: it cannot be stored.
         """
         problem.check()
         stored = path_of(self._library, problem)
-        places = (stored,) if self._run is None else (self._run / FILE, stored)
-        for path in places:
-            if (plan := self._found(path, problem)) is not None:
-                return plan
+        # A run goes on with its own, whatever the version of planner or simulator is by now.
+        own = (
+            None if self._run is None else self._found(self._run / FILE, problem, any_version=True)
+        )
+        if (plan := own or self._found(stored, problem)) is not None:
+            return plan
         task = problem.scene.task.id
         if self._progress is None:
-            raise PlanMissingError(f"the wrist of '{task}' is planned first")
-        with staging.locked(self._library):
-            with suppress(CorruptAssetError):  # another process was first
-                return read(stored, problem)
-            self._notify(f"the wrist of '{task}' is not planned yet: doing it once")
-            progress = self._progress
-            plan = plan_wrist(
-                problem, self._threads, lambda done, rounds: progress(_STEP, done, rounds)
+            raise PlanMissingError(
+                f"no wrist plan of '{task}' is stored yet; the run computes one first (10-40 s)"
             )
-            write(stored, plan, problem)
+        try:
+            with staging.making(stored, self._notify):
+                with suppress(CorruptAssetError):  # another process was first
+                    return read(stored, problem)
+                plan = self._plan(problem, self._progress)
+                write(stored, plan, problem)
+        except LibraryError as error:  # a library that others own
+            self._notify(f"{error}; the wrist plan of '{task}' is kept with the run alone")
+            plan = plan or self._plan(problem, self._progress)
+        return plan
+
+    def _plan(self, problem: WristProblem, progress: Progress) -> WristPlan:
+        task = problem.scene.task.id
+        self._notify(f"computing the wrist plan of '{task}' (once; it is kept in the library)")
+        plan = plan_wrist(
+            problem, self._threads, lambda done, rounds: progress(_STEP, done, rounds)
+        )
         self._notify(
-            f"{stored}: in {plan.seconds:.0f} s; the hand alone is "
+            f"wrist plan of '{task}', {plan.seconds:.0f} s: the hand alone is "
             f"{1e3 * plan.error_m.mean():.1f} mm off on average, within 1 cm in {plan.bound:.0%} "
             "of the steps"
         )
         return plan
 
-    def _found(self, path: Path, problem: WristProblem) -> WristPlan | None:
+    def _found(
+        self, path: Path, problem: WristProblem, any_version: bool = False
+    ) -> WristPlan | None:
         try:
-            return read(path, problem) if path.is_file() else None
+            return read(path, problem, any_version) if path.is_file() else None
         except CorruptAssetError as error:
             self._notify(f"{error}; it is not used")
             return None
@@ -110,8 +123,13 @@ def write(path: Path, plan: WristPlan, problem: WristProblem) -> None:
         raise LibraryError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-def read(path: Path, problem: WristProblem) -> WristPlan:
+def read(path: Path, problem: WristProblem, any_version: bool = False) -> WristPlan:
     """Read a problem's plan.
+
+    Args:
+        path: of the file.
+        problem: that it solves.
+        any_version: whether it will do that the plan begins where the problem does.
 
     Raises:
         CorruptAssetError: the file is missing, damaged, or of another problem.
@@ -122,8 +140,12 @@ def read(path: Path, problem: WristProblem) -> WristPlan:
     for name, shape in shapes.items():
         if not _is_finite(arrays.get(name), shape):
             raise CorruptAssetError(f"{path}: '{name}' is not {shape} finite numbers")
-    if not np.array_equal(arrays.get("key", []), _key(problem)):
-        raise CorruptAssetError(f"{path} is the plan of another task, hand or start")
+    same_start = np.array_equal(arrays["qpos"][0], problem.qpos)
+    if not (same_start and (any_version or np.array_equal(arrays.get("key", []), _key(problem)))):
+        raise CorruptAssetError(
+            f"{path} was computed for another task, hand, start, hold or load, or with another "
+            "version of planner or MuJoCo"
+        )
     frames, seconds = arrays["effort"].tolist()
     return WristPlan(arrays["commands"], arrays["qpos"], arrays["error_m"], int(frames), seconds)
 
