@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -50,6 +52,7 @@ _TINY, _SAME = 1e-9, 1e-6
 _LIMIT_ROUNDS = 6
 _FROZEN = 1e3  # armature with which a finger keeps its place, kg m^2
 _LONGEST = 250  # poses: the quadratic program's time grows with the third power
+_OF_FILES = re.compile("path|nbuffer").search  # fields that depend on where files lie
 _SMOOTH = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
 
 
@@ -123,8 +126,6 @@ class WristProblem:
     def key(self) -> str:
         """Return a SHA-256 over all that a plan depends on, the whole compiled model with it."""
         scene = self.scene
-        model = np.empty(mujoco.mj_sizeModel(scene.model), np.uint8)
-        mujoco.mj_saveModel(scene.model, None, model)
         numbers = (
             *(VERSION, self.substeps, self.hold_steps, scene.hand.num_wrist_joints),
             *(scene.index.num_compensated, scene.object_prefixes),
@@ -132,9 +133,22 @@ class WristProblem:
         digest = hashlib.sha256(f"{mujoco.__version__} {numbers}".encode())
         reference = self.reference.pos.numpy(), self.reference.quat.numpy()
         start = self.qpos, self.qvel, self.fingers
-        for array in (model, *reference, *start, self.load_n()):
+        for struct in (scene.model, scene.model.opt):
+            digest.update(_content(struct))
+        for array in (*reference, *start, self.load_n()):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
+
+
+def _content(struct: Any) -> bytes:
+    """Return all numbers of one of MuJoCo's structures, but not where its files lie."""
+    names = (name for name in sorted(dir(struct)) if name[0] != "_" and not _OF_FILES(name))
+    values = ((name, getattr(struct, name)) for name in names)
+    return b"".join(
+        name.encode() + np.ascontiguousarray(value).tobytes()
+        for name, value in values
+        if isinstance(value, (int, float, np.ndarray))
+    )
 
 
 @dataclass(frozen=True)
