@@ -94,3 +94,13 @@ def test_a_run_may_not_shrink_or_become_another() -> None:
         check_continues(compose(["total_frames=20"]), compose(["total_frames=10"]))
     with pytest.raises(RunError, match=r"'out/a' .*seed: 0 -> 3.*choose another run_dir"):
         check_continues(compose(["run_dir=out/a"]), compose(["run_dir=out/a", "seed=3"]))
+
+
+def test_keys_of_a_planned_wrist_count_only_where_it_is_planned() -> None:
+    def hashed(*overrides: str) -> str:
+        return identity_hash(compose(["+experiment=fast", *overrides]))
+
+    plain = "action.hold_steps=0", "action.carry_load=false"
+    clipped = "action.wrist_path=clipped"
+    assert hashed(clipped) == hashed(clipped, *plain)  # as it was before there were the keys
+    assert len({hashed(), *(hashed(key) for key in plain)}) == 3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pgdm.errors import UnknownNameError
+from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.mdp import rewards, terminations
 from pgdm.mdp.actions import ActionCfg, action_map
 from pgdm.mdp.context import StepContext
@@ -123,13 +123,18 @@ def test_unknown_layout_and_kind_name_the_valid_ones() -> None:
     with pytest.raises(UnknownNameError, match="released"):
         layout(ObsCfg("relesed"), tiny_index(), ref)
     with pytest.raises(UnknownNameError, match="residual"):
-        action_map(ActionCfg("residul", 3, 0.25, "carried", 0), tiny_index(), ref, torch.zeros(8))
+        action_map(
+            ActionCfg("residul", 3, 0.25, "carried", 0, False), tiny_index(), ref, torch.zeros(8)
+        )
 
 
 def test_absolute_action_is_affine_and_clipped() -> None:
     ref = reference([[0.0, 0, 0]] * 3)
     amap = action_map(
-        ActionCfg("absolute", 3, 0.25, "carried", 0), tiny_index(), ref, torch.zeros(8).double()
+        ActionCfg("absolute", 3, 0.25, "carried", 0, False),
+        tiny_index(),
+        ref,
+        torch.zeros(8).double(),
     )
     ctrl = amap.act(torch.tensor([[0.5, 0, 0, 0, 0, 0, 0.5, 9.0]]), torch.tensor([0]))[0]
     torch.testing.assert_close(ctrl, double([0.5, 0, 0, 0, 0, 0, 0.75, 2.0]))
@@ -138,7 +143,7 @@ def test_absolute_action_is_affine_and_clipped() -> None:
 def test_warm_start_adds_a_fifth_to_the_second_joint_and_the_fingers() -> None:
     ref = reference([[0.0, 0, 0]] * 3)
     start = double([0.5, 0, 0, 1.0, 0, 0, 0.5, 1.9])
-    amap = action_map(ActionCfg("absolute", 3, 0.25, "carried", 0), tiny_index(), ref, start)
+    amap = action_map(ActionCfg("absolute", 3, 0.25, "carried", 0, False), tiny_index(), ref, start)
     torch.testing.assert_close(amap.warm_start, double([0.5, 0.2, 0, 0.5, 0, 0, 0.2, 1.0]))
 
 
@@ -149,13 +154,13 @@ def test_a_path_out_of_range_can_be_corrected_only_if_it_is_brought_into_it() ->
     action, t = torch.tensor([[-1.0, 0, 0, 0, 0, 0, 0, 0]]), torch.tensor([1])
     start = torch.zeros(8).double()
     for path, expected in (("carried", 1.0), ("clipped", 0.75)):
-        amap = action_map(ActionCfg("residual", 3, 0.25, path, 0), tiny_index(), ref, start)
+        amap = action_map(ActionCfg("residual", 3, 0.25, path, 0, False), tiny_index(), ref, start)
         assert amap.act(action, t)[0, 0].item() == pytest.approx(expected)
 
 
 def test_residual_leads_by_three_steps_and_corrects_a_quarter() -> None:
     ref = reference([[0.0, 0.01 * k, 0.0] for k in range(10)])
-    cfg = ActionCfg("residual", 3, 0.25, "carried", 0)
+    cfg = ActionCfg("residual", 3, 0.25, "carried", 0, False)
     amap = action_map(cfg, tiny_index(), ref, torch.zeros(8).double())
     action = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0, 0], [0.0] * 8])
     ctrl = amap.act(action, torch.tensor([2, 8]))
@@ -168,9 +173,16 @@ def test_residual_leads_by_three_steps_and_corrects_a_quarter() -> None:
 def test_planned_commands_are_sent_as_they_are_and_corrected() -> None:
     ref = reference([[0.0, 0.01 * k, 0.0] for k in range(4)])
     commands = double([[0.1 * k, 0, 0, 0, 0, 0] for k in range(1, 4)])
-    cfg, start = ActionCfg("residual", 3, 0.25, "planned", 0), torch.zeros(8).double()
+    cfg, start = ActionCfg("residual", 3, 0.25, "planned", 0, False), torch.zeros(8).double()
     amap = action_map(cfg, tiny_index(), ref, start, commands)
     action = torch.tensor([[0.0] * 8, [0.0] * 8, [1.0, 0, 0, 0, 0, 0, 0, 0]])
     ctrl = amap.act(action, torch.tensor([0, 2, 3]))
     # No step ahead; after the last command it stays; corrected by a quarter of the half range.
     assert ctrl[:, 0].tolist() == pytest.approx([0.1, 0.3, 0.3 + 0.25])
+
+
+def test_a_planned_wrist_without_commands_is_refused() -> None:
+    cfg = ActionCfg("residual", 3, 0.25, "planned", 3, True)
+    ref = reference([[0.0, 0, 0], [0.1, 0, 0]])
+    with pytest.raises(ConfigError, match="commands of a plan"):
+        action_map(cfg, tiny_index(), ref, torch.zeros(8).double())
