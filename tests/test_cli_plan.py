@@ -205,6 +205,17 @@ def test_what_the_assets_here_have_not_is_told() -> None:
     assert approximate.endswith("approximate: piggybank-use1")
 
 
+def test_a_sweep_says_that_wrists_are_planned_first(library_home: Path) -> None:
+    tasks = "hammer-use1", "cup-pour1"
+    cfgs = [
+        compose(["+experiment=fast", f"task={task}", f"seed={seed}"])
+        for task in tasks
+        for seed in (0, 1)
+    ]
+    assert any("the wrist is planned in 2 tasks" in text for text in foresee(cfgs, open_library()))
+    assert not any("wrist" in text for text in foresee([compose([])], open_library()))
+
+
 def test_the_plugin_loads_nothing_heavy() -> None:
     code = (
         "import sys, hydra_plugins.pgdm_sweeper.sweeper as s;"

@@ -23,9 +23,11 @@ def foresee(cfgs: Iterable[ExperimentCfg], library: Library) -> list[str]:
         ConfigError: if the start of a run is missing, and would not be made.
     """
     replaced: Counter[tuple[str, str]] = Counter()
-    lacking, approximate = set(), set()
+    lacking, approximate, planned = set(), set(), set()
     for cfg in cfgs:
         motion = cfg.task.motion
+        if cfg.action.plans_wrist:
+            planned.add(motion)
         if recipe(cfg.method).needs_expert and motion in rebuild.TASKS:
             approximate.add(motion)
         if motion not in library.tasks():
@@ -41,6 +43,11 @@ def foresee(cfgs: Iterable[ExperimentCfg], library: Library) -> list[str]:
         f"'{source}' of their tasks (a TCDM checkout has, and 'pgdm pregrasp reach TASK' plans one)"
         for (source, used), count in replaced.items()
     ]
+    if planned:
+        found.append(
+            f"the wrist is planned in {len(planned)} tasks: a run whose plan the library lacks "
+            "computes it first, 10-40 s each"
+        )
     if lacking:
         names = ", ".join(sorted(lacking))
         found.append(f"only a TCDM checkout has these tasks, and none was imported here: {names}")
