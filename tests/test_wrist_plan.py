@@ -33,6 +33,7 @@ from pgdm.tracking.run_folder import read_json
 from pgdm.wrist import plan as planner
 from pgdm.wrist import stored
 from pgdm.wrist.plan import SMOOTH_STAGE, Stage, WristPlan, WristProblem, plan_wrist, simulate
+from pgdm.wrist.quadratic import Limits, Model
 from pgdm.wrist.stored import FILE, WristPlans, path_of, read, write
 
 TASK = "duck-lift"
@@ -190,9 +191,9 @@ def test_a_model_with_limits_finds_its_least(seed: int) -> None:
     random, size = np.random.default_rng(seed), 12
     jacobian, residuals = 30 * random.normal(size=(20, size)), random.normal(size=20)
     joints_by = np.tril(random.uniform(0.2, 1, (size, size)))
-    limits = planner._Limits(np.full(6, -0.1), np.full(6, 0.1))
+    limits = Limits(np.full(6, -0.1), np.full(6, 0.1))
     joints = random.uniform(-0.12, 0.12, (2, 6))
-    model = planner._Model(jacobian, residuals, joints_by, joints, limits)
+    model = Model(jacobian, residuals, joints_by, joints, limits)
     bound = np.full((2, 6), 0.05)
 
     def cost(step: np.ndarray) -> float:

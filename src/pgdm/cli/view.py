@@ -77,10 +77,7 @@ def view_wrist(
     builder = env_builder(cfg, assets(cfg, notify), notify)
     plan = builder.wrist
     assert plan is not None  # the experiment wants one
-    print(
-        f"the hand alone is {1e3 * plan.error_m.mean():.1f} mm off the exemplar on average, "
-        f"{1e3 * plan.error_m.max():.0f} mm at most, within 1 cm in {plan.bound:.0%} of the steps"
-    )
+    print(plan.described())
     if video is None:
         from pgdm.sim.viewer import show_motion
 

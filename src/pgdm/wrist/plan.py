@@ -14,12 +14,12 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import mujoco
 import numpy as np
 import torch
-from qpsolvers import solve_qp
 from scipy.spatial.transform import Rotation
 
 from pgdm.errors import ConfigError, SceneError
@@ -27,6 +27,7 @@ from pgdm.motion.reference import ObjectReference
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.scene import Scene, hand_alone
 from pgdm.wrist.path import feasible_path
+from pgdm.wrist.quadratic import Limits, Model
 
 VERSION = 1
 """Of the planner; plans in the library that another version stored are computed anew."""
@@ -36,9 +37,8 @@ NEAR_M = 0.01
 _SLIDES, _JOINTS = 3, 6  # the base: slides, then hinges
 
 # Scales chosen so that these errors cost the same: a grasp point 1 cm off, a palm turned by 1.1
-# rad, a joint 3 mm or 0.01 rad inside its margin.
+# rad, a joint 3 mm or 0.01 rad inside its margin (PER_LIMIT).
 _PER_M, _PER_RAD = 100.0, 0.9
-_PER_LIMIT = np.repeat((300.0, 90.0), _SLIDES)
 _MARGIN = np.repeat((0.005, 0.03), _SLIDES)  # m and rad that joints keep from their limits
 # Commands that change little from step to step, and lie near the path, are worth a little.
 _CHANGE, _NEAR_PATH = np.repeat((2.0, 0.6), _SLIDES), 0.2
@@ -48,8 +48,7 @@ _POOR, _GOOD = 0.3, 0.75
 _ENOUGH = 0.01  # a stage ends with a step that lowers the cost by less than this share
 _LEAST_TRUST = 1e-3  # or with a trust region below this, m and rad
 _LIFTED_M = 0.02
-_TINY, _SAME = 1e-9, 1e-6
-_LIMIT_ROUNDS = 6
+_TINY = 1e-9
 _FROZEN = 1e3  # armature with which a finger keeps its place, kg m^2
 _LONGEST = 250  # poses: the quadratic program's time grows with the third power
 _OF_FILES = re.compile("path|nbuffer").search  # fields that depend on where files lie
@@ -125,6 +124,10 @@ class WristProblem:
 
     def key(self) -> str:
         """Return a SHA-256 over all that a plan depends on, the whole compiled model with it."""
+        return self._key
+
+    @cached_property  # the model may have tens of megabytes
+    def _key(self) -> str:
         scene = self.scene
         numbers = (
             *(VERSION, self.substeps, self.hold_steps, scene.hand.num_wrist_joints),
@@ -169,6 +172,14 @@ class WristPlan:
     def sha256(self) -> str:
         """Return a hash of the commands."""
         return hashlib.sha256(self.commands.tobytes()).hexdigest()
+
+    def described(self) -> str:
+        """Return in a sentence how near the hand alone comes."""
+        return (
+            f"the hand alone is {1e3 * self.error_m.mean():.1f} mm off the exemplar on average, "
+            f"{1e3 * self.error_m.max():.0f} mm at most, within 1 cm in {self.bound:.0%} of the "
+            "steps"
+        )
 
     @property
     def bound(self) -> float:
@@ -285,7 +296,7 @@ class _Search:
         ranges = np.where(model.jnt_limited[:, None], model.jnt_range, (-np.inf, np.inf))[:_JOINTS]
         margin = np.minimum(_MARGIN, np.ptp(ranges, axis=1) / 4)
         self._low, self._high = index.ctrl_low[:_JOINTS], index.ctrl_high[:_JOINTS]
-        self._limits = _Limits(ranges[:, 0] + margin, ranges[:, 1] - margin)
+        self._limits = Limits(ranges[:, 0] + margin, ranges[:, 1] - margin)
         within = replace(
             index,
             ctrl_low=np.maximum(self._low, self._limits.low),
@@ -367,7 +378,7 @@ class _Search:
         change = np.diff(np.concatenate((self.path[:1], commands)), axis=0)
         return _CHANGE * change, _NEAR_PATH * _CHANGE * (commands - self.path[1:])
 
-    def _linearise(self, commands: np.ndarray, way: _Way) -> _Model:
+    def _linearise(self, commands: np.ndarray, way: _Way) -> Model:
         """Return the cost around commands, by finite differences of every step, side by side.
 
         The smooth model serves for both stages: kinks would only make it wrong farther away.
@@ -416,83 +427,10 @@ class _Search:
         change = np.tile(_CHANGE, steps)[:, None] * (np.eye(size) - np.eye(size, k=-_JOINTS))
         near = np.diag(np.tile(_NEAR_PATH * _CHANGE, steps))
         residuals = self._off(way.points, way.turns), *self._unsteady(commands)
-        return _Model(
+        return Model(
             np.concatenate((off_by.reshape(size, size), change, near)),
             np.concatenate([part.ravel() for part in residuals]),
             joints_by.reshape(size, size),
             way.qpos[1:, :_JOINTS],
             self._limits,
         )
-
-
-@dataclass(frozen=True)
-class _Limits:
-    """What joints keep away from."""
-
-    low: np.ndarray  # (6,) m, rad
-    high: np.ndarray
-
-    def nearest(self, joints: np.ndarray) -> np.ndarray:
-        """Return joints (K, 6) brought within."""
-        return joints.clip(self.low, self.high)
-
-    def beyond(self, joints: np.ndarray) -> np.ndarray:
-        """Return residuals (K, 6) of joints (K, 6): 0 within."""
-        return _PER_LIMIT * (joints - self.nearest(joints))
-
-
-class _Model:
-    """The cost around commands: squares of linear residuals, and of joints beyond their limits.
-
-    Args:
-        jacobian: of the residuals (R, K * 6).
-        residuals: at the commands (R,).
-        joints_by: how the joints depend on the commands (K * 6, K * 6).
-        joints: at the commands (K, 6).
-        limits: that joints keep away from.
-    """
-
-    def __init__(
-        self,
-        jacobian: np.ndarray,
-        residuals: np.ndarray,
-        joints_by: np.ndarray,
-        joints: np.ndarray,
-        limits: _Limits,
-    ) -> None:
-        self._hessian = 2 * jacobian.T @ jacobian + _TINY * np.eye(jacobian.shape[1])
-        self._slope = 2 * jacobian.T @ residuals
-        self._joints_by, self._joints, self._limits = joints_by, joints, limits
-        self._weights = np.tile(_PER_LIMIT, len(joints))
-
-    def least(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the best change of the commands within bounds, (K, 6) each.
-
-        Which joints it takes beyond a limit shows only afterwards: some rounds find it.
-        """
-        low, high = low.ravel(), np.maximum(high, low + _TINY).ravel()
-        best = step = np.zeros_like(low)
-        for _ in range(_LIMIT_ROUNDS):
-            joints = self._after(step)
-            limit = self._limits.nearest(joints)
-            rows = self._weights[:, None] * self._joints_by
-            off = (self._weights * (self._joints - limit).ravel())[at := (joints != limit).ravel()]
-            hessian = self._hessian + 2 * rows[at].T @ rows[at]
-            slope = self._slope + 2 * rows[at].T @ off
-            found = solve_qp(hessian, slope, lb=low, ub=high, solver="daqp")
-            if found is None or np.allclose(found, step, atol=_SAME):
-                break
-            step = found
-            best = max(best, step, key=self.gain)
-        return best.reshape(-1, _JOINTS)
-
-    def gain(self, step: np.ndarray) -> float:
-        """Return by how much a change (K * 6,) should lower the cost."""
-        steady = self._slope @ step + 0.5 * step @ self._hessian @ step
-        before, after = (
-            (self._limits.beyond(joints) ** 2).sum() for joints in (self._joints, self._after(step))
-        )
-        return float(before - after - steady)
-
-    def _after(self, step: np.ndarray) -> np.ndarray:
-        return self._joints + (self._joints_by @ step).reshape(-1, _JOINTS)

@@ -88,11 +88,7 @@ class WristPlans:
         plan = plan_wrist(
             problem, self._threads, lambda done, rounds: progress(_STEP, done, rounds)
         )
-        self._notify(
-            f"wrist plan of '{task}', {plan.seconds:.0f} s: the hand alone is "
-            f"{1e3 * plan.error_m.mean():.1f} mm off on average, within 1 cm in {plan.bound:.0%} "
-            "of the steps"
-        )
+        self._notify(f"wrist plan of '{task}', {plan.seconds:.0f} s: {plan.described()}")
         return plan
 
     def _found(
