@@ -1,19 +1,19 @@
-# Every target sets up .venv from nothing and is quick when nothing changed.
+# Every target sets up .venv if needed, and is quick if nothing has changed.
 #
-#   make run     the main job on real data: minutes of training, then a table and a video
+#   make run     the quickstart on real data: minutes of training, then a table and a video
 #   make test    the tests
 #   make check   lint, format, types, layers
 #   make slow    the tests that take minutes
-#   make docs    the documentation site, built strictly
-#   make clean   remove what the other targets made (never your runs)
+#   make docs    the documentation site; warnings are errors
+#   make clean   remove everything the other targets create (never your runs)
 #
-# More options for the program behind run, test and slow go into ARGS: make test ARGS="-k rotations -x".
+# ARGS adds options to the program behind run, test and slow: make test ARGS="-k rotations -x".
 
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS :=
 
-# Named so that a machine whose python3 is older still works.
+# python3.11 first, for machines whose python3 is older.
 PYTHON := $(shell command -v python3.11 || command -v python3)
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 SOURCES := pyproject.toml constraints.txt
@@ -24,8 +24,8 @@ SOURCES := pyproject.toml constraints.txt
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' $(firstword $(MAKEFILE_LIST))
 
-# The stamps are written last, so an interrupted installation is taken up again. pip is brought to
-# one version too: `pgdm assets fetch` asks it where files lie, and old ones download to answer.
+# The stamps are written last, so that an interrupted installation is repeated. pip is updated to a
+# pinned version too: `pgdm assets fetch` queries it for file locations, which old ones download.
 $(VENV)/.pip:
 	@test -n "$(PYTHON)" || { echo "No python3 found: install Python 3.11 or newer."; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \

@@ -1,12 +1,12 @@
-"""How far ablated starts are from what the ablations ask for, over all tasks.
+"""How far ablated starts deviate from what the ablations ask for, over all tasks.
 
     python benchmark/ablations.py [--csv FILE] [TASK ...]
 
-Fetches what it can, other tasks need a checkout; ``pregrasp=planned`` falls back to mined where no
-plan is stored. Prints a summary in Markdown, as on docs/ablations.md, and writes every start as
-CSV. The column ``residual_gap_m`` tells how far the fingertips stay from their places in the
-pre-grasp (of ``none``: the planned one), on average, if an action of ``action=residual`` corrects
-the wrist as well as it can.
+Fetches the assets it can; other tasks need a checkout. ``pregrasp=planned`` falls back to mined if
+no plan is stored. Prints a summary in Markdown, as on docs/ablations.md, and writes a CSV row for
+every start. The column ``residual_gap_m`` is the fingertips' mean distance from their positions in
+the pre-grasp (for ``none``: the planned one) after the best correction of the base that an action
+of ``action=residual`` can give.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ import mujoco
 import numpy as np
 from mujoco.minimize import least_squares
 
+from pgdm.config.compose import compose
 from pgdm.config.groups import available
-from pgdm.config.store import compose
 from pgdm.experiment import assets, env_builder
-from pgdm.pregrasp.ablate import ablate
+from pgdm.pregrasp.ablation.ablate import ablate
 from pgdm.pregrasp.sources import StartState, start_state
 from pgdm.sim.scene import Scene
 
@@ -45,24 +45,24 @@ def measure(task: str) -> list[dict[str, Any]]:
     goals: dict[str, StartState] = {}
     for pregrasp in STARTS:
         for ablation in available("ablation") if pregrasp != "none" else ("none",):
-            # The task does not matter here, so that each choice is composed only once.
+            # Without the task, which does not matter here: each choice is composed only once.
             cfg = compose([f"pregrasp={pregrasp}", f"ablation={ablation}"])
             stored = start_state(cfg.pregrasp, builder.motion, builder.scene)
             began = time.process_time()
             found = ablate(cfg.ablation, stored, builder.scene, builder.motion.substeps)
             seconds = time.process_time() - began
-            figures = {k: v for k, v in dataclasses.asdict(found).items() if k != "start"}
+            values = {k: v for k, v in dataclasses.asdict(found).items() if k != "start"}
             goals.setdefault(pregrasp, stored)
             goal = goals["planned" if pregrasp == "none" else pregrasp]
             gap = residual_gap(builder.scene, goal.qpos, found.start.qpos)
-            row = {"pregrasp": pregrasp, "ablation": ablation, "task": task, **figures}
+            row = {"pregrasp": pregrasp, "ablation": ablation, "task": task, **values}
             row["residual_gap_m"] = gap
             rows.append(row | {"seconds": seconds})
     return rows
 
 
 def residual_gap(scene: Scene, stored: np.ndarray, ablated: np.ndarray) -> float:
-    """Return the fingertips' mean distance from their places after the best correction, m."""
+    """Return the fingertips' mean distance from their positions after the best correction, m."""
     model, index = scene.model, scene.index
     data, base = mujoco.MjData(model), index.num_base_joints
     tips = index.point_geoms[index.fingertips]

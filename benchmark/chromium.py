@@ -1,4 +1,4 @@
-"""A browser without a window, driven as a person drives it: clicks, drags, keys, pictures."""
+"""A headless browser, driven by clicks, drags, keys and screenshots."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser")
 HOST = "127.0.0.1"
 SIZE = 1280, 800  # pixels
 START_S = 60.0
-_DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # never by a proxy
+_DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # never through a proxy
 _OPTIONS = (
     *("--headless", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    # WebGL in software, as nobody knows what graphics the machine has.
+    # WebGL in software, which works on every machine.
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--remote-debugging-port=0", f"--window-size={SIZE[0]},{SIZE[1]}"),
-    f"--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE {HOST}",  # no other machine
+    f"--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE {HOST}",  # no access to other machines
 )
 
 
 class Tab:
-    """One page, over the DevTools protocol.
+    """One page, controlled over the DevTools protocol.
 
     Args:
         address: of its websocket.
@@ -52,7 +52,7 @@ class Tab:
             mobile=False,
         )
         self("Page.enable")
-        self("Emulation.setFocusEmulationEnabled", enabled=True)  # also behind another tab
+        self("Emulation.setFocusEmulationEnabled", enabled=True)  # also in the background
 
     def __call__(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Send a command and return its result."""
@@ -72,7 +72,7 @@ class Tab:
         self._socket.close()
 
     def open(self, url: str, until: str) -> None:
-        """Open a page and wait until its text has some words."""
+        """Open a page and wait until its text contains ``until``."""
         self("Page.navigate", url=url)
         self.wait(f"document.body && document.body.innerText.includes({json.dumps(until)})")
 
@@ -88,15 +88,15 @@ class Tab:
         end = time.monotonic() + seconds
         while not self.script(f"!!({condition})"):
             if time.monotonic() > end:
-                raise TimeoutError(f"the page never had: {condition}")
+                raise TimeoutError(f"the page did not satisfy: {condition}")
             time.sleep(0.1)
 
     def text(self) -> str:
-        """Return what a person can read on the page."""
+        """Return the visible text of the page."""
         return str(self.script("document.body.innerText"))
 
     def place(self, element: str) -> tuple[float, float]:
-        """Return the middle of an element, an expression, once it is scrolled to, in pixels."""
+        """Scroll to an element, a JavaScript expression, and return its middle, in pixels."""
         script = (
             f"(() => {{ const e = {element}; e.scrollIntoView({{block: 'center'}}); "
             "const r = e.getBoundingClientRect(); "
@@ -118,7 +118,7 @@ class Tab:
         )
 
     def mouse(self, kind: str, x: float, y: float) -> None:
-        """Press, move or release the left button at a place, in pixels."""
+        """Press, move or release the left button at a point, in pixels."""
         held = 0 if kind == "mouseReleased" else 1
         button = "none" if kind == "hovered" else "left"
         if kind == "hovered":
@@ -134,9 +134,9 @@ class Tab:
         )
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], moves: int = 10) -> None:
-        """Drag from one place to another, in pixels."""
+        """Drag from one point to another, in pixels."""
         self.mouse("hovered", *start)
-        time.sleep(0.3)  # what is dragged by hovering must be drawn once to be found
+        time.sleep(0.3)  # an object must be drawn once while hovered over
         self.mouse("mousePressed", *start)
         for i in range(1, moves + 1):
             share = i / moves
@@ -145,28 +145,28 @@ class Tab:
         self.mouse("mouseReleased", *end)
 
     def key(self, key: str, code: str, number: int, modifiers: int = 0) -> None:
-        """Press and release a key; modifiers: 2 is Ctrl, 8 is Shift."""
+        """Press and release a key; modifiers: 2 for Ctrl, 8 for Shift."""
         common = {"key": key, "code": code, "windowsVirtualKeyCode": number}
         self("Input.dispatchKeyEvent", type="rawKeyDown", modifiers=modifiers, **common)
         self("Input.dispatchKeyEvent", type="keyUp", modifiers=modifiers, **common)
 
     def type_into(self, element: str, text: str) -> None:
-        """Replace the text of an input by typing, and press Enter."""
+        """Replace the text of an input, and press Enter."""
         self.click(element)
         self.script(f"{element}.select()")
         self("Input.insertText", text=text)
         self.key("Enter", "Enter", 13)
 
     def picture(self) -> bytes:
-        """Return what the page looks like, PNG."""
+        """Return a screenshot of the page, PNG."""
         return base64.b64decode(self("Page.captureScreenshot", format="png")["data"])
 
 
 @contextlib.contextmanager
 def browser() -> Iterator[Chromium]:
-    """Run a browser, while inside."""
+    """Run a browser inside the context."""
     assert PROGRAM is not None, "needs chromium"
-    # It may write into its folder until its last child has gone.
+    # The browser may write into its folder until its last child process has exited.
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
             [PROGRAM, *_OPTIONS, f"--user-data-dir={profile}", "about:blank"],
@@ -195,7 +195,7 @@ class Chromium:
         self._port = port
 
     def tab(self, size: tuple[int, int] = SIZE) -> Tab:
-        """Open a new page; a small one is drawn sooner."""
+        """Open a new page; a small one renders faster."""
         request = urllib.request.Request(
             f"http://{HOST}:{self._port}/json/new?about:blank", method="PUT"
         )

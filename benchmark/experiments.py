@@ -1,18 +1,17 @@
-"""What was tried to learn in fewer frames: hypothesis, command and outcome of every experiment.
+"""Attempts to learn in fewer frames: hypothesis, command and outcome of every experiment.
 
     python benchmark/experiments.py               train what is missing, then write the table
     python benchmark/experiments.py fast kernel   only these
     python benchmark/experiments.py --collect     write the table of what is stored
 
-Each experiment changes `+experiment=fast` and runs on the suite `tune6`, which shares no task with
-`quick6`, on which only what is kept is confirmed. What was stored under settings that have changed
-since is trained anew. Two runs train at a time, one thread each.
+Each experiment changes `+experiment=fast` and runs on the suite `tune6`. It shares no task with
+`quick6`, which only confirms the changes that are kept. A run stored under settings that have
+changed since is trained again. Two runs train at a time, one thread each.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
@@ -20,11 +19,12 @@ from typing import Any
 
 from short_runs import Job, curves, finished, train_all
 
+from pgdm.config.compose import compose
 from pgdm.config.identity import identity_hash
-from pgdm.config.saved import FILE, load_config
-from pgdm.config.store import compose
+from pgdm.config.saved import load_config
 from pgdm.config.suites import suite
-from pgdm.tracking.run_folder import RunFolder, read_json
+from pgdm.runs.files import CONFIG, read_json, write_json
+from pgdm.runs.folder import RunFolder
 
 RESULTS = Path(__file__).parent / "results" / "experiments"
 TUNE6 = suite("tune6")
@@ -60,7 +60,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "kernel",
-        "a second tracking term, 5 exp(-10 e), gives a slope everywhere",
+        "the wide tracking term, 5 exp(-10 e), gives a slope everywhere",
         ("shaping.kernel_weight=5",),
         "",
     ),
@@ -103,13 +103,13 @@ def identity_of(job: Job) -> str:
 
 
 def current(job: Job) -> bool:
-    """Return whether a result is stored that was made with today's settings and length."""
+    """Return whether the stored result has today's settings and length."""
     one = read_json(RESULTS / f"{job.name}.json")
     return one.get("identity") == identity_of(job) and one["frames"] >= FRAMES
 
 
 def collect(run: Path, job: Job) -> dict[str, Any] | None:
-    """Return what a finished run reached and how, or None if it has not finished."""
+    """Return settings and curves of a finished run, or None if it has not finished."""
     result = finished(run)
     if result is None or identity_hash(load_config(run)) != identity_of(job):
         return None
@@ -121,8 +121,8 @@ def collect(run: Path, job: Job) -> dict[str, Any] | None:
 
 
 def make_way(run: Path, job: Job) -> None:
-    """Rename a run's folder if it was made with other settings: no run would go on in it."""
-    if not (run / FILE).exists() or RunFolder(run).busy:
+    """Rename a run's folder if it has other settings: no run could be resumed in it."""
+    if not (run / CONFIG).exists() or RunFolder(run).busy:
         return
     if (old := identity_hash(load_config(run))) != identity_of(job):
         run.rename(run.with_name(f"{run.name}-{old}-{run.stat().st_mtime:.0f}"))
@@ -164,7 +164,7 @@ def table(stored: dict[str, list[dict[str, Any]]]) -> str:
 def main() -> None:
     """Train, collect, write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", help="which experiments; default: all")
+    parser.add_argument("names", nargs="*", help="which experiments [all]")
     parser.add_argument("--runs", type=Path, default=Path("runs/experiments"))
     parser.add_argument("--collect", action="store_true", help="do not train")
     options = parser.parse_args()
@@ -185,7 +185,7 @@ def main() -> None:
         for job in missing:
             one = collect(options.runs / job.name, job)
             if one is not None:
-                (RESULTS / f"{job.name}.json").write_text(json.dumps(one, indent=1) + "\n")
+                write_json(RESULTS / f"{job.name}.json", one)
         stored[e.name] = [read_json(RESULTS / f"{job.name}.json") for job in jobs if current(job)]
         if any(stored.values()):
             page = f"# {FRAMES:,} frames of tune6\n\n`python benchmark/experiments.py`\n\n"

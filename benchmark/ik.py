@@ -1,14 +1,14 @@
-"""How well inverse kinematics poses each hand as a person's is: every task, every hand.
+"""How well inverse kinematics follows human hands: every task, every hand.
 
     python benchmark/ik.py [--tasks hammer-use1 cup-pour1] [--hands adroit dhand dmanus]
 
-A pose counts as a success if every measured fingertip is within 2 cm of its target (the human's
-fingertip; for Adroit behind a whole human hand that of the human's joints with Adroit's bones, as
-the published trajectories were made), nothing of the hand cuts into anything, and all joints are
-within their limits. Where the library has no human hand, the task's own hand at its stored
-pre-grasp is followed. Beside it, for Adroit: the distance from the published pre-grasps, and how
-far these are themselves from the published trajectory of the same hand at the same moment. What is
-done is stored as it goes; a second call goes on. Needs a checkout's assets and the experts.
+A pose is a success if every measured fingertip is within 2 cm of its target (the human's
+fingertip; for Adroit following a whole human hand, that of the human's joints with Adroit's bone
+lengths, as in the published trajectories), the hand penetrates nothing, and all joints are within
+their limits. If the library has no human hand for a task, its own hand at the mined pre-grasp is
+followed. For Adroit also: the distance from the mined pre-grasps, and their distance from the
+published trajectory of the same hand in the same frame. Results are stored as they are computed; a
+second call resumes. Needs the assets of a TCDM checkout and the experts.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ import time
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from pgdm.config.compose import compose
 from pgdm.config.groups import available
 from pgdm.config.hands import own_hand
-from pgdm.config.store import compose
 from pgdm.library import open_library
-from pgdm.library.provide import Spoken
-from pgdm.pregrasp.ik import HandIk
-from pgdm.pregrasp.mocap import of_task, retarget
+from pgdm.library.progress import ProgressLines
+from pgdm.pregrasp.hand_geometry import posed
+from pgdm.pregrasp.retarget.hand_ik import HandIk
+from pgdm.pregrasp.retarget.mocap import of_task, retarget
 from pgdm.sim.contact import FREE_M
 from pgdm.sim.scene import Scene, build_scene
 
@@ -40,10 +40,7 @@ FINGERS = slice(8, 30)
 
 def fingertips(ik: HandIk, qpos: np.ndarray) -> np.ndarray:
     """Return the fingertips (F, 3) m."""
-    data = mujoco.MjData(ik.scene.model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(ik.scene.model, data)
-    return data.geom_xpos[ik.scene.index.point_geoms[ik.shape.rows[:, 2]]].copy()
+    return posed(ik.scene, qpos).geom_xpos[ik.scene.index.point_geoms[ik.shape.rows[:, 2]]]
 
 
 def rms(a: np.ndarray, b: np.ndarray) -> float:
@@ -52,7 +49,7 @@ def rms(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def measure(task: str, hand: str) -> dict[str, Any]:
-    """Return the figures of one hand at one task."""
+    """Return the metrics of one hand for one task."""
     library = open_library()
     cfg = compose([f"task={task}", f"hand={hand}"])
     scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
@@ -79,12 +76,12 @@ def measure(task: str, hand: str) -> dict[str, Any]:
         "seconds": seconds,
     }
     if hand == "adroit" and found["human"]:
-        found |= reference(scene, task, qpos)
+        found |= published(scene, task, qpos)
     return {k: round(v, 4) if isinstance(v, float) else v for k, v in found.items()}
 
 
-def reference(scene: Scene, task: str, qpos: np.ndarray) -> dict[str, float]:
-    """Return how far an Adroit is from the published pre-grasp, and that from the expert."""
+def published(scene: Scene, task: str, qpos: np.ndarray) -> dict[str, float]:
+    """Return the distances of an Adroit's pose and of the expert's from the mined pre-grasp."""
     library, ik = open_library(), HandIk(scene)
     mined = library.motion(task).starts["mined"].qpos
     expert = np.concatenate((library.expert(task).qpos[0], mined[30:]))
@@ -107,7 +104,7 @@ def table(found: dict[str, dict[str, Any]]) -> str:
     """Return the results as Markdown."""
     lines = [
         "# Inverse kinematics\n",
-        "`python benchmark/ik.py`; what counts as a success is said there.\n",
+        "`python benchmark/ik.py`, which defines success.\n",
         "| hand | followed | tasks | success | fingertips, mean | worst finger, median | "
         "penetration > 0 | s |",
         "|---|---|--:|--:|--:|--:|--:|--:|",
@@ -125,7 +122,7 @@ def table(found: dict[str, dict[str, Any]]) -> str:
     rows = [r for r in found.values() if "published_fingers_rad" in r]
     if rows:
         lines += [
-            f"\n## Against the {len(rows)} published pre-grasps of Adroit\n",
+            f"\n## Against the {len(rows)} mined pre-grasps of Adroit\n",
             "| | fingers, RMS | fingertips | penetration, worst |",
             "|---|--:|--:|--:|",
         ]
@@ -141,7 +138,7 @@ def table(found: dict[str, dict[str, Any]]) -> str:
                 f"{median(rows, f'{key}_fingertips_mm'):.1f}) | {depth:.1f} mm |"
             )
     lines += [
-        "\n## Not a success\n",
+        "\n## Failures\n",
         "| task | hand | worst | what is unreachable |",
         "|---|---|--:|---|",
     ]
@@ -155,17 +152,17 @@ def table(found: dict[str, dict[str, Any]]) -> str:
 
 
 def mean(rows: list[dict[str, Any]], key: str) -> float:
-    """Return the mean of a figure."""
+    """Return the mean of a metric."""
     return float(np.mean([row[key] for row in rows]))
 
 
 def median(rows: list[dict[str, Any]], key: str) -> float:
-    """Return the median of a figure."""
+    """Return the median of a metric."""
     return float(np.median([row[key] for row in rows]))
 
 
 def main() -> None:
-    """Measure what is not measured yet, and write the tables."""
+    """Measure what is missing, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tasks", nargs="+", default=[t for t in available("task") if t[0] != "_"])
     parser.add_argument("--hands", nargs="+", default=HANDS, choices=HANDS)
@@ -174,7 +171,7 @@ def main() -> None:
     stored = FOLDER / "ik.json"
     found = json.loads(stored.read_text()) if stored.is_file() else {}
     todo = [(t, h) for t in chosen.tasks for h in chosen.hands if f"{t}/{h}" not in found]
-    say = Spoken(print)
+    say = ProgressLines(print)
     for i, (task, hand) in enumerate(todo):
         say("tasks", i, len(todo))
         found[f"{task}/{hand}"] = measure(task, hand)

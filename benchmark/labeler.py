@@ -1,11 +1,11 @@
-"""How many interactions a second the labeler follows, with a real page open in a browser.
+"""Interactions per second that the labeler handles, with a real page open in a browser.
 
 python benchmark/labeler.py                       writes benchmark/results/labeler.json
-python benchmark/labeler.py --picture FILE.jpg    takes the documentation's picture instead
+python benchmark/labeler.py --picture FILE.jpg    writes the documentation's picture instead
 
-An interaction is what a page sends when a slider or a handle is moved: joints, forward
-kinematics, contacts and distances are computed, and the scene is sent to the page. The labeler
-runs on one core; the browser draws in software, without a graphics card.
+An interaction is one change of a slider or handle: joints, forward kinematics, contacts and
+distances are computed, and the scene is sent to the page. The labeler runs on one core; the browser
+renders in software, without a GPU.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from chromium import Chromium, Tab, browser
 from PIL import Image
 from rich.console import Console
 
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
 from pgdm.pregrasp.labeler import shapes
 from pgdm.pregrasp.labeler.page import LabelPage
-from pgdm.pregrasp.labeler.store import Draft, Poses
+from pgdm.pregrasp.labeler.poses import Draft, Poses
 
 TASKS = ("hammer-use1", "dhand-cup", "dmanus-crackerbox")
 INTERACTIONS = 300
@@ -49,20 +49,20 @@ def opened(task: str, origin: str) -> tuple[LabelPage, Draft]:
 
 
 def look_at(chrome: Chromium, page: LabelPage) -> Tab:
-    """Open a page and wait until hand and object are drawn."""
+    """Open a page and wait until hand and object are rendered."""
     tab = chrome.tab()
     tab.open(page.url, "fingertips to the object")
     end = time.monotonic() + PATIENCE_S
     while time.monotonic() < end:
         with Image.open(io.BytesIO(tab.picture())) as picture:
             seen = np.asarray(picture.convert("RGB"))[200:600, 200:800].reshape(-1, 3)
-        if len(np.unique(seen // 8, axis=0)) > 100:  # an empty page has a few
+        if len(np.unique(seen // 8, axis=0)) > 100:  # an empty page has only a few
             return tab
-    raise TimeoutError("the page was not drawn")
+    raise TimeoutError("the page was not rendered")
 
 
 def moves(page: LabelPage) -> dict[str, Callable[[float], None]]:
-    """Return what a person can do, each told how far it is, from -1 to 1."""
+    """Return the interactions, each a function of its amplitude from -1 to 1."""
     state = page.state
     pos, quat = state.kinematics.wrist_pose(state.qpos)
     tip = state.kinematics.tip(state.qpos, 0)
@@ -78,41 +78,38 @@ def moves(page: LabelPage) -> dict[str, Callable[[float], None]]:
 
 
 def measure(page: LabelPage, move: Callable[[float], None]) -> tuple[float, float]:
-    """Return interactions a second by the clock, and by the processor's time of the labeler."""
+    """Return interactions per second of wall time, and of the labeler's CPU time."""
     began, used = time.perf_counter(), time.process_time()
     for i in range(INTERACTIONS):
         move(float(np.sin(0.3 * i)))
-        page.mailbox.wait()  # so that none is overtaken
+        page.mailbox.wait()  # so that none is dropped
     page.server.flush()
-    clock, processor = time.perf_counter() - began, time.process_time() - used
-    return INTERACTIONS / clock, INTERACTIONS / processor
+    wall_s, cpu_s = time.perf_counter() - began, time.process_time() - used
+    return INTERACTIONS / wall_s, INTERACTIONS / cpu_s
 
 
 def run(chrome: Chromium, console: Console) -> dict[str, Any]:
     """Measure all tasks."""
-    figures: dict[str, Any] = {}
+    rates: dict[str, Any] = {}
     for task in TASKS:
         with console.status(f"{task}: starting"):
             page, draft = opened(task, "planned")
             tab = look_at(chrome, page)
-        figures[task] = {}
+        rates[task] = {}
         for name, move in moves(page).items():
             with console.status(f"{task}: {name}"):
-                clock, processor = measure(page, move)
-            figures[task][name] = {
-                "per_s": round(clock, 1),
-                "per_s_of_one_core": round(processor, 1),
-            }
-            console.print(f"{task} {name}: {clock:.0f}/s, {processor:.0f} a core-second")
+                wall, cpu = measure(page, move)
+            rates[task][name] = {"per_s": round(wall, 1), "per_s_of_one_core": round(cpu, 1)}
+            console.print(f"{task} {name}: {wall:.0f}/s, {cpu:.0f} per core-second")
         tab.wait("document.body.innerText.includes('fingertips')")  # it is still there
         tab.close()
         page.close()
         draft.close()
-    return figures
+    return rates
 
 
 def take_picture(chrome: Chromium, path: Path) -> None:
-    """Write the picture of the documentation: the hand a little too low."""
+    """Write the documentation's picture: the hand slightly too low."""
     page, draft = opened("hammer-use1", "planned")
     pos, quat = page.state.kinematics.wrist_pose(page.state.qpos)
     for phase in ("start", "update", "end"):
@@ -120,7 +117,7 @@ def take_picture(chrome: Chromium, path: Path) -> None:
     page.mailbox.wait()
     tab = look_at(chrome, page)
     tab.script("document.querySelector('#webgl-software-rendering button')?.click()")
-    time.sleep(10.0)  # until the warning has gone, and all is drawn in full
+    time.sleep(10.0)  # until the warning is gone, and everything is rendered
     with Image.open(io.BytesIO(tab.picture())) as picture:
         picture.convert("RGB").save(path, quality=QUALITY, optimize=True)
     page.close()
@@ -129,9 +126,9 @@ def take_picture(chrome: Chromium, path: Path) -> None:
 
 
 def main() -> None:
-    """Measure, or take the picture."""
+    """Measure, or write the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="Take the picture instead.")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="Write the picture instead.")
     chosen = parser.parse_args()
     console = Console()
     with tempfile.TemporaryDirectory() as user, browser() as chrome:
@@ -139,9 +136,9 @@ def main() -> None:
         if chosen.picture is not None:
             return take_picture(chrome, chosen.picture)
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # of this process, not the browser
-        figures = run(chrome, console)
+        rates = run(chrome, console)
     load = os.getloadavg()[0]
-    result = {"interactions": INTERACTIONS, "cores": 1, "load": round(load, 1), "tasks": figures}
+    result = {"interactions": INTERACTIONS, "cores": 1, "load": round(load, 1), "tasks": rates}
     RESULT.write_text(json.dumps(result, indent=1) + "\n")
     print(f"wrote {RESULT}")
 

@@ -1,22 +1,20 @@
-"""What pgdm learns in a million frames on six varied tasks; stores results and curves beside it.
+"""What pgdm learns in a million frames on six varied tasks; stores results and curves.
 
     python benchmark/learning.py                    train what is missing, then collect
-    python benchmark/learning.py --frames 300000    go so far only; a later call goes on from there
-                                                    (a run that was begun for more goes on to that)
+    python benchmark/learning.py --frames 300000    train for fewer frames; a later call resumes
+                                                    (a run started for more is trained to its end)
     python benchmark/learning.py --settings fast --seeds 0
-    python benchmark/learning.py --collect          collect only, also of runs that still go on
+    python benchmark/learning.py --collect          collect only, also from running runs
 
-Five settings, each the same for all tasks: `+experiment=fast`, the same with a wrist that is not
-planned but follows a clipped or a feasible path, `algo=ppo_fast action=residual`, and the paper's
-PPO on its actions.
-Each run is an ordinary `pgdm-run`, so that stopping and starting again goes on where it was. Two
-runs train at a time, one thread each.
+Five settings, each the same for all tasks: `+experiment=fast`, the same with a wrist that follows a
+clipped or a feasible path instead of a plan, `algo=ppo_fast action=residual`, and the paper's PPO
+on its actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two runs train at a
+time, one thread each.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,17 +22,17 @@ from typing import Any
 import matplotlib.pyplot as plt
 from short_runs import Job, curves, train_all
 
-from pgdm.config.saved import FILE, load_config
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
+from pgdm.config.saved import load_config
 from pgdm.config.suites import suite
 from pgdm.experiment import assets, env_builder
-from pgdm.tracking.run_folder import read_json
-from pgdm.tracking.run_log import RunLog, metrics_of
+from pgdm.runs.files import CONFIG, LOG, RESULT, read_json, write_json
+from pgdm.runs.log import RunLog, metrics_of
 
 RESULTS = Path(__file__).parent / "results" / "learning"
 FRAMES = 1_000_000
 EARLY = 300_000
-"""Frames after which the table shows success a first time."""
+"""The table also shows success after so many frames."""
 
 QUICK6 = suite("quick6")
 FAST = ("+experiment=fast", "eval.interval_frames=50000")
@@ -52,13 +50,13 @@ KINDS = ("eval_sampled", "eval_deterministic")
 
 
 def collect(run: Path, job: Job) -> dict[str, Any] | None:
-    """Return how far a run has come and what it reached there, or None if it has not begun."""
+    """Return how far a run has come and its metrics there, or None if it has not started."""
     curve = curves(run, "eval", [f"{kind}/{name}" for kind in KINDS for name in CURVES])
     frames = curve.pop("frames")
     if not frames:
         return None
-    cfg, result = load_config(run), read_json(run / "result.json")
-    last = [line for line in RunLog(run / "metrics.jsonl").read() if line["kind"] == "eval"][-1]
+    cfg, result = load_config(run), read_json(run / RESULT)
+    last = [line for line in RunLog(run / LOG).read() if line["kind"] == "eval"][-1]
     return {
         "task": job.task,
         "setting": job.setting,
@@ -86,17 +84,17 @@ def stored(job: Job) -> dict[str, Any]:
 
 
 def store(job: Job, one: dict[str, Any]) -> None:
-    """Store the result of a run, unless one of more frames is stored."""
+    """Store the result of a run, unless one with more frames is stored."""
     if one["frames"] >= stored(job).get("frames", 0):
-        (RESULTS / f"{job.name}.json").write_text(json.dumps(one, indent=1) + "\n")
+        write_json(RESULTS / f"{job.name}.json", one)
 
 
 def to_train(runs: Path, job: Job, frames: int) -> Job | None:
-    """Return a run with its length, or None if its stored result is of so many frames."""
+    """Return a job with its length, or None if a result of so many frames is stored."""
     if stored(job).get("frames", 0) >= frames:
         return None
     run = runs / job.name
-    begun = load_config(run).total_frames if (run / FILE).exists() else 0
+    begun = load_config(run).total_frames if (run / CONFIG).exists() else 0
     # The length of a run may only grow.
     return replace(job, overrides=(*job.overrides, f"total_frames={max(frames, begun)}"))
 
@@ -111,7 +109,7 @@ def with_old_scenes(found: list[dict[str, Any]], scenes: dict[str, str]) -> list
     """Return results with ``old_scene``, whether the scene has changed since.
 
     Args:
-        found: the results; of those that do not tell their scene nothing is known.
+        found: the results; one without a scene hash counts as current.
         scenes: hash of each task's scene today.
     """
     return [
@@ -121,7 +119,7 @@ def with_old_scenes(found: list[dict[str, Any]], scenes: dict[str, str]) -> list
 
 
 def at(one: dict[str, Any], name: str, frames: int) -> float | None:
-    """Return a metric of a run at its evaluation next after so many frames, or None."""
+    """Return a metric of a run at its first evaluation after so many frames, or None."""
     for when, value in zip(one["curve_frames"], one["curves"][name], strict=True):
         if when >= frames:
             return value
@@ -129,7 +127,7 @@ def at(one: dict[str, Any], name: str, frames: int) -> float | None:
 
 
 def table(found: list[dict[str, Any]]) -> str:
-    """Return the results as a Markdown table, the paper's figures beside them."""
+    """Return the results as a Markdown table, next to the paper's."""
     head = (
         f"| task | setting | seed | success at {EARLY:,} frames, sampled | deterministic "
         "| frames | minutes | success, sampled | deterministic | lifted, sampled "
@@ -152,9 +150,9 @@ def table(found: list[dict[str, Any]]) -> str:
 
 
 def means(found: list[dict[str, Any]]) -> str:
-    """Return each setting's mean over tasks and seeds, of the runs that have come so far.
+    """Return each setting's mean over the tasks and seeds that have come so far.
 
-    What was made in a scene that has changed since is left out.
+    Runs in a scene that has changed since are left out.
     """
     lines = []
     for setting in SETTINGS:
@@ -177,12 +175,12 @@ def means(found: list[dict[str, Any]]) -> str:
 
 
 def remarks(found: list[dict[str, Any]]) -> str:
-    """Return what is to be known of the table and the picture."""
+    """Return notes on the table and the picture."""
     lines = []
     if any(r["old_scene"] for r in found):
         lines.append(
-            "Old scene: made before the task's scene was corrected, and in no mean; trained anew "
-            "once the stored file is removed.\n\n"
+            "Old scene: trained before the task's scene was corrected, and in no mean; to train it "
+            "again, remove the stored file.\n\n"
         )
     if untimed := sum("curve_minutes" not in r for r in found):
         lines.append(
@@ -219,7 +217,7 @@ def plot(found: list[dict[str, Any]], path: Path) -> None:
     if shown:
         # The door is not lifted: its last panel is free.
         axes[-1][-1].legend([handles[name] for name in shown], shown, fontsize=8, loc="center")
-    figure.suptitle("sampled policy, one line a seed (the paper's figures are after 50,000,000)")
+    figure.suptitle("sampled policy, one line a seed (the paper's are after 50,000,000 frames)")
     figure.tight_layout()
     figure.savefig(path, dpi=80)
 

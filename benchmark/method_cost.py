@@ -7,7 +7,7 @@ import time
 import torch
 from rich.console import Console
 
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.envs.build import EnvBuilder
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
@@ -18,7 +18,7 @@ IMITATING = ("deepmimic", "full")
 
 
 def step_methods_in_turn(builders: dict[str, EnvBuilder], num_envs: int) -> dict[str, float]:
-    """Step an env of each method with the same actions, one control step each; return s of each."""
+    """Step an env of each method in turn with the same actions; return the time of each, s."""
     generator = torch.Generator().manual_seed(0)
     envs = {name: builder.make(num_envs) for name, builder in builders.items()}
     spent = dict.fromkeys(envs, 0.0)
@@ -27,7 +27,7 @@ def step_methods_in_turn(builders: dict[str, EnvBuilder], num_envs: int) -> dict
         noise = torch.randn((num_envs, first.action_dim), generator=generator)
         action = first.warm_start() + 0.2 * noise
         names = list(envs)
-        # Who comes first changes, as it finds the caches filled by the one before.
+        # The order rotates: each env runs with caches that the one before has filled.
         for name in names[step % len(names) :] + names[: step % len(names)]:
             start = time.perf_counter()
             envs[name].step(action)
@@ -38,10 +38,10 @@ def step_methods_in_turn(builders: dict[str, EnvBuilder], num_envs: int) -> dict
 def measure_methods(
     task: str, num_envs: int, rounds: int, console: Console
 ) -> dict[str, list[float]]:
-    """Return each method's speed in every round, alone and beside PGDM's."""
+    """Return each method's speed in every round, in steps/s and relative to PGDM's."""
     torch.set_num_threads(1)
     library = open_library()
-    # No end of its own, so that all methods step the same states.
+    # Without terminations of their own all methods step the same states.
     same = ["method.imitation.max_hand_error=null"]
     builders = {
         name: env_builder(
@@ -50,13 +50,13 @@ def measure_methods(
         )
         for name in METHODS
     }
-    figures: dict[str, list[float]] = {}
+    speeds: dict[str, list[float]] = {}
     for number in range(rounds):
         with console.status(f"methods, round {number + 1} of {rounds}"):
             spent = step_methods_in_turn(builders, num_envs)
         for name, seconds in spent.items():
             speed = STEPS * num_envs / seconds
-            figures.setdefault(f"make_batch method={name}", []).append(speed)
+            speeds.setdefault(f"make_batch method={name}", []).append(speed)
             ratio = spent["pgdm"] / seconds
-            figures.setdefault(f"make_batch method={name} / pgdm", []).append(ratio)
-    return figures
+            speeds.setdefault(f"make_batch method={name} / pgdm", []).append(ratio)
+    return speeds

@@ -1,14 +1,14 @@
-"""Whether the methods' terms bite: short runs on three tasks; stores curves beside it.
+"""Whether the methods' reward terms have an effect: short runs on three tasks; stores curves.
 
     python benchmark/methods.py                  train what is missing, then collect
     python benchmark/methods.py --collect        collect only
-    python benchmark/methods.py --frames 8192 --tasks cup-pour1 --out /tmp/try     a small try
+    python benchmark/methods.py --frames 8192 --tasks cup-pour1 --out /tmp/try     a short trial
 
-Asked: does the hand come closer to the expert's with DeepMimic than without; do fingertips come
+Questions: does the hand come closer to the expert's with DeepMimic than without; do fingertips come
 closer to the contact points with GRAFF*; does the curriculum's weight follow its line; does a hand
-that starts at its reset pose touch the object at all. PGDM is run with the expert's terms at weight
-0, so that the same is measured of it. Each run is an ordinary `pgdm-run` and goes on if stopped.
-Figures are means over the 25 episodes of an evaluation, actions sampled.
+that starts at its reset pose touch the object at all. PGDM is trained with the expert's terms at
+weight 0, so that the same metrics are measured. Each run is an ordinary `pgdm-run`: the same
+command resumes it. Values are means over the 25 episodes of an evaluation, actions sampled.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from short_runs import Job, curves, finished, train_all
 
 from pgdm.config.saved import load_config
 from pgdm.experiment import assets, env_builder
-from pgdm.rl.checkpoint import CheckpointFolder
-from pgdm.rl.evaluate import load_policy
+from pgdm.rl.checkpoint import CheckpointFolder, read_checkpoint
+from pgdm.rl.evaluate import policy_of
 from pgdm.seeding import torch_stream
 from pgdm.sim.contact import FingertipDistance
 
@@ -65,7 +65,7 @@ EVALUATED = tuple(
 
 
 def settings(frames: int) -> dict[str, tuple[str, ...]]:
-    """Return what is compared, by name."""
+    """Return the overrides of each setting."""
     ramp = f"method.curriculum.ramp_frames={round(frames * RAMP_SHARE)}"
     return {
         "pgdm": MEASURED,
@@ -98,7 +98,7 @@ def touched(run: Path) -> float:
     builder = env_builder(cfg, assets(cfg, print))
     newest = CheckpointFolder(run / "checkpoints", keep_last=1).newest()
     assert newest is not None  # the run has finished
-    policy, noise = load_policy(newest[0]), torch_stream(cfg.seed, "eval")
+    policy, noise = policy_of(read_checkpoint(newest[0]), newest[0]), torch_stream(cfg.seed, "eval")
     env = builder.make(TOUCH_EPISODES, 1, cfg.seed, "eval")
     model = builder.scene.model
     data, distance = mujoco.MjData(model), FingertipDistance(builder.scene)
@@ -154,7 +154,7 @@ def _row(run: dict[str, Any]) -> str:
 
 
 def plot(found: Sequence[dict[str, Any]], tasks: Sequence[str], path: Path) -> None:
-    """Draw what each term is about over frames, a column a task and a line a setting."""
+    """Draw the metric of each term over frames: a column per task, a line per setting."""
     panels = (
         ("eval", f"eval_sampled/{HAND}", "fingertips from\nthe expert's [m]"),
         ("eval", f"eval_sampled/{CONTACT}", "fingertips from\ncontact points [m]"),
@@ -192,7 +192,7 @@ def main() -> None:
     parser.add_argument("--collect", action="store_true", help="do not train")
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--tasks", nargs="+", default=list(TASKS))
-    parser.add_argument("--out", type=Path, default=RESULTS, help="where curves are stored")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the curves")
     options = parser.parse_args()
     length = (
         f"total_frames={options.frames}",

@@ -1,9 +1,9 @@
-"""How well pre-grasps are predicted for objects that were never seen.
+"""How well pre-grasps are predicted for unseen objects.
 
     python benchmark/predictor.py [--out FOLDER] [--once] [--no-lift] [TASK ...]
 
-For each object a predictor is fitted on all others' pre-grasps, and compared on the object's tasks
-with the stored pre-grasp (``mined``). One JSON file a task, so that it goes on where it stopped;
+For each object a predictor is fitted on the pre-grasps of all others, and compared on the object's
+tasks with the mined pre-grasp. Writes one JSON file per task, so that it can resume,
 then the tables of docs/pregrasps/learned.md and a picture. Needs a TCDM checkout in the library.
 """
 
@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from pgdm.config.compose import compose
 from pgdm.config.groups import available
-from pgdm.config.store import compose
 from pgdm.library import Motion, Start, open_library
 from pgdm.pregrasp.predict.candidates import Candidate, free_ones, ranked
 from pgdm.pregrasp.predict.grasp_vector import GraspFrame
@@ -35,14 +35,14 @@ HAND = "adroit"
 BEST_OF = (1, 8, 32)
 CANDIDATES = 4
 CHOOSING, JUDGING = 12, 16  # policies of the lift test
-CHOOSING_SEED, JUDGING_SEED = 0, 1  # not judged by what it was chosen with
+CHOOSING_SEED, JUDGING_SEED = 0, 1  # judged by other policies than it was chosen by
 SHOWN = ("hammer-use1", "mug-drink3", "stamp-stamp1", "alarmclock-lift")
 
 Case = tuple[Scene, Motion, Example]
 
 
 def cases() -> list[Case]:
-    """Return all tasks of the hand whose object lies free."""
+    """Return the tasks of the hand whose object lies free."""
     library, found = open_library(), []
     for task in available("task"):
         cfg = compose([f"task={task}"])
@@ -68,13 +68,13 @@ def best_of(
     for seed in range(rounds):
         samples = predictor.sample(one.code, count, seed)
         found.append(min(off(frame, vector, one) for vector in samples))
-        if count == 1:  # the mean: no chance in it
+        if count == 1:  # the mean does not depend on the seed
             break
     return float(np.mean(found))
 
 
 def measure(case: Case, every: Sequence[Example], with_lift: bool) -> dict[str, Any]:
-    """Return what is found for one task."""
+    """Return the results of one task."""
     scene, motion, one = case
     train = [e for e in every if e.object != one.object]
     began = time.monotonic()
@@ -116,18 +116,18 @@ def lifts(
         row[f"stored_{kind}_lift"] = rate(start.qpos)
     for name, predictor in predictors.items():
         first = free_ones(frame, predictor.sample(one.code, 1), objects)[0]
-        row |= figures(f"{name}_first", first, rate, frame, one)
+        row |= metrics(f"{name}_first", first, rate, frame, one)
         samples = predictor.sample(one.code, 3 * CANDIDATES)
         chosen = ranked(free_ones(frame, samples, objects)[:CANDIDATES], choose)[0]
-        row |= figures(f"{name}_chosen", chosen, rate, frame, one)
+        row |= metrics(f"{name}_chosen", chosen, rate, frame, one)
     moved = free_ones(palm, [nearest(train, one)], objects)[0]
-    return row | figures("nearest", moved, rate, frame, one)
+    return row | metrics("nearest", moved, rate, frame, one)
 
 
-def figures(
+def metrics(
     name: str, candidate: Candidate, rate: Any, frame: GraspFrame, one: Example
 ) -> dict[str, Any]:
-    """Return what is written of one candidate."""
+    """Return the metrics of one candidate."""
     away = np.linalg.norm(frame.fingertips(candidate.qpos) - one.fingertips, axis=1)
     return {
         f"{name}_lift": rate(candidate.qpos),
@@ -177,12 +177,12 @@ def summary(rows: list[dict[str, Any]]) -> str:
 
 
 def column(rows: list[dict[str, Any]], name: str) -> np.ndarray:
-    """Return a column's values where there is one."""
+    """Return a column's values of the rows that have it."""
     return np.array([row[name] for row in rows if row.get(name) is not None], float)
 
 
 def picture(found: list[Case], rows: dict[str, dict[str, Any]], path: Path) -> None:
-    """Write stored, mean and learned hands of a few tasks, one row a task."""
+    """Write a picture of stored, mean and learned hands, one row per task of a few."""
     sheets = []
     with tempfile.TemporaryDirectory() as folder:
         for scene, motion, one in found:

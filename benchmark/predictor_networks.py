@@ -2,9 +2,10 @@
 
     python benchmark/predictor_networks.py
 
-An ensemble of 8 small networks with Gaussian heads (64 hidden units, tanh; mean and spread of the
-10 main components of the vectors; noise on the codes and weight decay against over-fitting), on the
-examples and by the measure of ``predictor.py``: each object left out in turn. Writes one JSON file.
+An ensemble of 8 small networks with Gaussian heads (64 hidden units, tanh; mean and standard
+deviation of the first 10 principal components of the grasp vectors; noise on the codes and weight
+decay against over-fitting), with the examples and the metric of ``predictor.py``: each object left
+out in turn. Writes one JSON file.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ STEPS, LEARNING_RATE = 600, 3e-3
 CODE_NOISE = 0.3  # in standard deviations of the codes
 DECAYS = (0.3,)
 COUNTS = (1, 8, 32)
-NARROW, WIDE = -1.5, 1.5  # limits of the logarithm of the spread
+NARROW, WIDE = -1.5, 1.5  # limits of the logarithm of the standard deviation
 
 
 class Ensemble:
-    """Networks that share their data and nothing else, trained side by side.
+    """Networks trained in parallel on the same data, independent of each other.
 
     Args:
         codes: (n, B).
@@ -58,7 +59,7 @@ class Ensemble:
         self._train((x - self._code_mean) / self._code_scale, z, decay)
 
     def sample(self, code: np.ndarray, count: int) -> np.ndarray:
-        """Return vectors (count, D), the ensemble's mean first."""
+        """Return grasp vectors (count, D), the ensemble's mean first."""
         x = (torch.from_numpy(code).float() - self._code_mean) / self._code_scale
         with torch.no_grad():
             mean, spread = self._heads(x.expand(MEMBERS, 1, -1))
@@ -79,7 +80,7 @@ class Ensemble:
             optimizer.step()
 
     def _heads(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and logarithm of the spread, (M, n, k) each, at codes (M, n, B)."""
+        """Return mean and log standard deviation, (M, n, k) each, at codes (M, n, B)."""
         first, bias, second, offset = self._weights
         out = torch.tanh(x @ first + bias) @ second + offset
         mean, spread = out.chunk(2, dim=-1)

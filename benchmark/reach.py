@@ -1,14 +1,14 @@
-"""Our reach plans beside the released ones, and how good every pre-grasp is, over all tasks.
+"""Our reach plans compared with the released ones, and the quality of every pre-grasp.
 
     python benchmark/reach.py [--seed 0 1 2] [TASK ...]
     python benchmark/reach.py --write
 
-The first plans the reach to the mined pre-grasp of each task, carries out the plan that is stored
-with the task beside it, and measures every pre-grasp there is. Each task's figures are stored in
-results/reach/ as soon as they are there; what is stored is not done again, unless its file is
-removed. The second makes the summary, the picture and the tables of docs/pregrasps/ from them.
-Needs a library with the tasks' assets and experts; plans come with a TCDM checkout only. Predicted
-hands are those of benchmark/predictor.py, demonstrations those that PGDM_DAPG_DEMOS names.
+The first plans the reach to the mined pre-grasp of each task, plays the plan stored with the task
+for comparison, and measures every pre-grasp of the task. Results are stored in results/reach/, one
+file per task; a stored result is not computed again. The second writes the summary, the picture and
+the tables of docs/pregrasps/ from them. Needs a library with the tasks' assets and experts;
+released plans come with a TCDM checkout only. Predicted hands are those of benchmark/predictor.py,
+and demonstrations those that PGDM_DAPG_DEMOS names.
 """
 
 from __future__ import annotations
@@ -27,16 +27,18 @@ from typing import Any
 import numpy as np
 
 from pgdm import paths
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.config.suites import suite
 from pgdm.library import Library, Motion, open_library
-from pgdm.pregrasp import demonstrations, teleop
-from pgdm.pregrasp.ablate import ablate
-from pgdm.pregrasp.mocap import object_joints, of_expert, retarget
-from pgdm.pregrasp.plans import figures, pose_of, published
+from pgdm.pregrasp.ablation.ablate import ablate
 from pgdm.pregrasp.quality import LiftTest, quality
-from pgdm.pregrasp.reach import REACH, measure, plan_reach
-from pgdm.pregrasp.sources import StartState, start_state
+from pgdm.pregrasp.reach.plan import measure
+from pgdm.pregrasp.reach.planner import REACH, plan_reach
+from pgdm.pregrasp.reach.stored import pose_of, published
+from pgdm.pregrasp.retarget.mocap import of_expert, retarget
+from pgdm.pregrasp.sources import StartState, object_joints, start_state
+from pgdm.pregrasp.teleop import cut as teleop
+from pgdm.pregrasp.teleop import demonstrations
 from pgdm.sim.scene import Scene, build_scene
 
 HERE = Path(__file__).parent
@@ -62,7 +64,7 @@ def main() -> None:
 
 
 def update(task: str, seed: int) -> None:
-    """Measure a task with a seed, unless that is done, and store it."""
+    """Measure a task with a seed, unless it is stored, and store it."""
     path = RESULTS / f"{task}.json"
     row: Row = json.loads(path.read_text()) if path.is_file() else {"task": task, "ours": {}}
     if row.get("search") != repr(REACH):
@@ -78,14 +80,14 @@ def update(task: str, seed: int) -> None:
     plan = plan_reach(scene, target, motion.substeps, seed=seed)
     cpu_s = time.process_time() - began
     row["ours"][str(seed)] = {
-        **figures(plan),
+        **plan.metrics(),
         "seconds": round(plan.seconds, 1),
         "cpu_s": cpu_s,
         "failures": plan.failures,
     }
     if (stored := published(motion, scene)) is not None and stored.actions is not None:
         theirs = measure(scene, stored.actions, target, motion.substeps)
-        row["released"] = {**figures(theirs), "failures": theirs.failures}
+        row["released"] = {**theirs.metrics(), "failures": theirs.failures}
     known = row.setdefault("quality", {})
     starts = {**all_starts(scene, library, motion), "reach": plan.state.qpos}
     lift = LiftTest(scene, motion.substeps)
@@ -101,9 +103,9 @@ def update(task: str, seed: int) -> None:
 
 
 def all_starts(scene: Scene, library: Library, motion: Motion) -> dict[str, np.ndarray]:
-    """Return the task's starts of every source, and the mined one with other fingers."""
+    """Return the task's starts of every source, and the mined one with ablated fingers."""
     starts = {name: start.qpos for name, start in motion.starts.items()}
-    if motion.id in library.experts().experts:  # a person's hand was recorded
+    if motion.id in library.experts().experts:
         human = of_expert(library.expert(motion.id), motion)
         starts["mocap"] = retarget(scene, library, motion, human).result.qpos
     predicted = PREDICTED / f"{scene.task.id}.json"
@@ -123,7 +125,7 @@ def all_starts(scene: Scene, library: Library, motion: Motion) -> dict[str, np.n
 
 
 def read_rows() -> list[Row]:
-    """Return what is stored, in the order of the suite."""
+    """Return the stored results, in the order of the suite."""
     found = {path.stem: json.loads(path.read_text()) for path in RESULTS.glob("*.json")}
     return [found[task] for task in suite("tcdm50") if task in found]
 
@@ -135,10 +137,10 @@ COLUMNS: dict[str, tuple[str, float, float, str]] = {
     "object_moved_m": ("object moved [mm]", 1e3, 5.0, ".1f"),
     "depth_m": ("penetration [mm]", 1e3, 1.0, ".1f"),
 }
-"""Figures of a plan: heading, unit's factor, what is allowed, format."""
+"""Metrics of a plan: heading, factor to its unit, tolerance in that unit, format."""
 
 SOURCES = {
-    "mined": "`mined`: as found",
+    "mined": "`mined`",
     "planned": "`planned`: after the released plan",
     "reach": "after our plan",
     "mocap": "`mocap`: ours, from the recorded human hand",
@@ -148,6 +150,7 @@ SOURCES = {
     "open_hand": "`mined`, `ablation=open_hand`",
     "mean_hand": "`mined`, `ablation=mean_hand`",
 }
+HEADS = {"reach": "our plan", "predicted": "learned, ours", "learned": "learned, released"}
 
 
 def write_pages(rows: list[Row]) -> None:
@@ -161,7 +164,7 @@ def write_pages(rows: list[Row]) -> None:
 
 
 def replace_between(page: Path, name: str, lines: list[str]) -> None:
-    """Put lines where a page has its ``<!-- name -->`` ... ``<!-- /name -->``."""
+    """Replace what a page has between ``<!-- name -->`` and ``<!-- /name -->``."""
     before, found, rest = page.read_text().partition(f"<!-- {name} -->\n")
     _, ended, after = rest.partition(f"<!-- /{name} -->")
     if not found or not ended:
@@ -170,7 +173,7 @@ def replace_between(page: Path, name: str, lines: list[str]) -> None:
 
 
 def summary(rows: list[Row]) -> list[str]:
-    """Return the distribution of errors: ours of every seed, and the released plans'."""
+    """Return the distribution of errors: ours over all seeds, and the released plans'."""
     ours = [one for row in rows for one in row["ours"].values()]
     theirs = [row["released"] for row in rows if "released" in row]
     seeds = max(len(row["ours"]) for row in rows)
@@ -193,7 +196,7 @@ def spread(values: list[float], form: str) -> str:
 
 
 def per_task(rows: list[Row]) -> list[str]:
-    """Return every task's figures: ours of the first seed, then the released plan's."""
+    """Return the metrics of each task: ours of the first seed, then the released plan's."""
     heads = [
         "task",
         *(head for head, *_ in COLUMNS.values()),
@@ -215,12 +218,12 @@ def per_task(rows: list[Row]) -> list[str]:
 
 
 def bold_above(value: float, limit: float, form: str) -> str:
-    """Return a number, bold if it is above what is allowed."""
+    """Return a number, bold if it exceeds its tolerance."""
     return f"**{value:{form}}**" if value > limit else f"{value:{form}}"
 
 
 def quality_summary(rows: list[Row]) -> list[str]:
-    """Return each source's figures over its tasks."""
+    """Return the metrics of each source over its tasks."""
     heads = ["source", "tasks", "free of contact", "penetration [mm]", "fingertips [mm]"]
     lines = table_head([*heads, "palm [deg]", "lift", "tasks lifted"])
     for name, title in SOURCES.items():
@@ -239,16 +242,16 @@ def quality_summary(rows: list[Row]) -> list[str]:
 
 
 def quality_per_task(rows: list[Row]) -> list[str]:
-    """Return each task's lift rate, penetration, distance and palm of each source."""
+    """Return lift rate, penetration, distance and palm angle of each task and source."""
     names = [name for name in SOURCES if any(name in row["quality"] for row in rows)]
-    lines = table_head(["task", *(f"{name.replace('_', ' ')}" for name in names)])
+    lines = table_head(["task", *(HEADS.get(name, name.replace("_", " ")) for name in names)])
     for row in rows:
         lines.append(row_of([row["task"], *(cell(row["quality"].get(name)) for name in names)]))
     return lines
 
 
 def cell(one: Row | None) -> str:
-    """Return what can be said of a pre-grasp in a few characters."""
+    """Return the quality of a pre-grasp in a few characters."""
     if one is None:
         return "-"
     lift = "no lift" if math.isnan(one["lift_rate"]) else f"**{one['lift_rate']:.0%}**"
@@ -273,7 +276,7 @@ def row_of(cells: list[str]) -> str:
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Draw how the errors are distributed, as shares of the tasks below a value."""
+    """Draw histograms of the errors, as shares of the plans."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 3.2), layout="constrained")

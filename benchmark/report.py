@@ -1,9 +1,9 @@
-"""How long `pgdm report` takes for the paper's whole validation, and how much memory.
+"""Time and memory of `pgdm report` on runs as many and as long as the paper's.
 
     python benchmark/report.py [--keep FOLDER]
 
-Fabricates 150 finished runs, 50 tasks with three seeds, as a training of 50M frames leaves them
-(2 GB), then runs the command twice in a process of its own and stores the figures beside this file.
+Fabricates 150 finished runs, 50 tasks with three seeds, with the files of a training of 50M frames
+(2 GB), then runs the command twice in a process of its own and stores the measurements in results/.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ import numpy as np
 import yaml
 from PIL import Image
 
+from pgdm.config.compose import PAPER_FRAMES, compose_plain
 from pgdm.config.groups import available
-from pgdm.config.store import PAPER_FRAMES, compose_plain
 
 RESULT = Path(__file__).parent / "results" / "report.json"
 SEEDS = 3
-STEP = 4096  # frames of an iteration
+STEP = 4096  # frames per iteration
 EVAL_EVERY = 244  # iterations, about 1M frames
-# As long a line as a training writes.
+# Makes a line as long as that of a training.
 OTHERS = ", ".join(f'"train/metric_{i}": 0.{i:02d}23456789012345' for i in range(28))
 
 
 def tasks() -> list[dict[str, Any]]:
-    """Return the configuration of each task that the paper has figures for."""
+    """Return the configuration of each task of the paper."""
     found = (compose_plain([f"task={name}"]) for name in available("task"))
     return [config for config in found if config["task"]["paper_success"] is not None]
 
 
 def fabricate(root: Path, config: dict[str, Any], seed: int, frames: int = PAPER_FRAMES) -> None:
-    """Write the folder of a finished run whose success rises to about the paper's."""
+    """Write the folder of a finished run whose success rises to about that of the paper."""
     chance = random.Random(f"{config['task']['id']} {seed}")
     folder = root / config["task"]["id"] / f"s{seed}"
     (folder / "videos").mkdir(parents=True)
@@ -73,7 +73,7 @@ def fabricate(root: Path, config: dict[str, Any], seed: int, frames: int = PAPER
 
 
 def evaluation(success: float, chance: random.Random) -> dict[str, float]:
-    """Return the metrics of an evaluation, as many as a real one has."""
+    """Return as many metrics as a real evaluation has."""
     found: dict[str, float] = {}
     for kind in ("sampled", "deterministic"):
         noisy = min(1.0, max(0.0, success + chance.gauss(0, 0.02)))
@@ -86,7 +86,7 @@ def evaluation(success: float, chance: random.Random) -> dict[str, float]:
 
 
 def measure(runs: Path, out: Path) -> float:
-    """Run the command and return its seconds."""
+    """Run the command and return its time, s."""
     program = "import sys; from pgdm.cli.main import main; sys.exit(main())"
     start = time.perf_counter()
     command = [sys.executable, "-c", program, "report", str(runs), "--out", str(out)]
@@ -95,9 +95,9 @@ def measure(runs: Path, out: Path) -> float:
 
 
 def main() -> None:
-    """Fabricate, measure, store."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--keep", type=Path, help="folder to leave runs and report in")
+    """Fabricate runs, measure the command, and store the measurements."""
+    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
+    parser.add_argument("--keep", type=Path, help="folder in which to keep runs and report")
     keep = parser.parse_args().keep
     place = keep or Path(tempfile.mkdtemp(prefix="pgdm-report-"))
     runs, out = place / "runs", place / "report"
@@ -119,7 +119,7 @@ def main() -> None:
             "peak_memory_mb": used.ru_maxrss // 1024,
             "page_mb": round((out / "report.html").stat().st_size / 1e6, 2),
             "cores": len(os.sched_getaffinity(0)),
-            "load": round(os.getloadavg()[0], 1),  # of other programs too
+            "load": round(os.getloadavg()[0], 1),  # including other programs
             "python": platform.python_version(),
         }
     finally:

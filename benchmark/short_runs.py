@@ -1,8 +1,7 @@
-"""Short trainings behind a stored result: ordinary runs, so that stopped ones go on."""
+"""Short runs behind a stored result, ordinary ones, so that those that stopped can be resumed."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import subprocess
@@ -13,8 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pgdm.tracking.run_folder import CONFIG, RESULT, RunFolder, read_json
-from pgdm.tracking.run_log import FILE_NAME, RunLog, metrics_of
+from pgdm.runs.files import CONFIG, LOG, RESULT, read_json, write_json
+from pgdm.runs.folder import RunFolder
+from pgdm.runs.log import RunLog, metrics_of
 
 AT_A_TIME = 2
 TRAIN_POINTS = 40
@@ -29,7 +29,7 @@ class Job:
     setting: str
     overrides: tuple[str, ...]
     seed: int | None = None
-    """Where there are several."""
+    """None if the setting has a single seed."""
 
     @property
     def name(self) -> str:
@@ -38,9 +38,14 @@ class Job:
         return name if self.seed is None else f"{name}-s{self.seed}"
 
 
+def program(name: str) -> str:
+    """Return the path of one of pgdm's commands."""
+    return str(Path(sys.executable).with_name(name))
+
+
 def train(folder: Path, job: Job) -> int:
-    """Train one run to its end, or go on with it; return the exit code."""
-    command = [str(Path(sys.executable).with_name("pgdm-run")), f"task={job.task}", *job.overrides]
+    """Train one run to its end, or resume it; return the exit code."""
+    command = [program("pgdm-run"), f"task={job.task}", *job.overrides]
     command += [f"run_dir={folder / job.name}", "num_threads=1", "tracking=none"]
     command += [] if job.seed is None else [f"seed={job.seed}"]
     folder.mkdir(parents=True, exist_ok=True)
@@ -49,10 +54,10 @@ def train(folder: Path, job: Job) -> int:
 
 
 def train_all(folder: Path, jobs: Sequence[Job]) -> None:
-    """Train all that is missing, a few at a time, one thread each.
+    """Train jobs, a few at a time, one thread each.
 
     Raises:
-        SystemExit: if one failed, after all have had their turn.
+        SystemExit: if one failed, after all have run.
     """
     with ThreadPoolExecutor(AT_A_TIME) as pool:
         codes = list(pool.map(lambda job: train(folder, job), jobs))
@@ -62,22 +67,22 @@ def train_all(folder: Path, jobs: Sequence[Job]) -> None:
 
 
 def finished(run: Path) -> dict[str, Any] | None:
-    """Return the result of a run without its film, or None if it has not finished."""
-    result = read_json(run / "result.json")
+    """Return the result of a run without its video, or None if it has not finished."""
+    result = read_json(run / RESULT)
     if result.get("status") != "finished":
         return None
     return {key: value for key, value in result.items() if key != "video"}
 
 
 def curves(run: Path, kind: str, names: Sequence[str]) -> dict[str, list[float | None]]:
-    """Return metrics of a run over its records of a kind, rounded, beside their ``frames``.
+    """Return metrics of a run at each record of a kind, rounded, with ``frames`` and ``minutes``.
 
     Args:
         run: its folder.
         kind: ``train`` or ``eval``.
-        names: metrics; None, which JSON has and NaN is not, where one was not recorded.
+        names: metrics; None, unlike NaN valid JSON, stands for one that was not recorded.
     """
-    lines = [line for line in RunLog(run / "metrics.jsonl").read() if line["kind"] == kind]
+    lines = [line for line in RunLog(run / LOG).read() if line["kind"] == kind]
     found: dict[str, list[float | None]] = {
         "frames": [int(line["frames"]) for line in lines],
         "minutes": [round(float(line["time_s"]) / 60, 2) for line in lines],
@@ -89,15 +94,15 @@ def curves(run: Path, kind: str, names: Sequence[str]) -> dict[str, list[float |
 
 
 def store(found: RunFolder, target: Path, results: Path) -> None:
-    """Keep what a report needs of a run, its training curve thinned, in a folder of results."""
+    """Copy what a report needs of a run, its training curve thinned, to a folder of results."""
     target.mkdir(parents=True, exist_ok=True)
-    where = f"run_dir: {target.relative_to(results)}"  # not a path of the machine it ran on
+    where = f"run_dir: {target.relative_to(results)}"  # instead of a path of this machine
     config = (found.path / CONFIG).read_text(encoding="utf-8")
     config = re.sub(r"^run_dir: .*$", where, config, flags=re.MULTILINE)
     (target / CONFIG).write_text(config, encoding="utf-8")
-    (target / RESULT).write_text(json.dumps({**found.result, "video": None}, indent=1) + "\n")
-    (target / FILE_NAME).unlink(missing_ok=True)
-    log = RunLog(target / FILE_NAME)
+    write_json(target / RESULT, {**found.result, "video": None})
+    (target / LOG).unlink(missing_ok=True)
+    log = RunLog(target / LOG)
     for record in found.log.thinned(TRAIN_POINTS):
         metrics, kind = metrics_of(record), str(record["kind"])
         log.append(
@@ -107,3 +112,10 @@ def store(found: RunFolder, target: Path, results: Path) -> None:
             time_s=float(record["time_s"]),
             kind=kind,
         )
+
+
+def report(results: Path) -> int:
+    """Report on the runs that are stored in a folder of results; return the exit code."""
+    # From that folder: the page names the folders it was given.
+    command = [program("pgdm"), "report", "runs", "--out", "report"]
+    return subprocess.run(command, cwd=results).returncode

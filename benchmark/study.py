@@ -1,14 +1,14 @@
 """The paper's comparisons at a hundredth of its length, on the suite quick6; stores runs and page.
 
-    python benchmark/study.py                       run what is missing (hours), then report
-    python benchmark/study.py --settings graff-residual      some of the settings only
-    python benchmark/study.py --collect             report only
+    python benchmark/study.py                             train what is missing (hours), then report
+    python benchmark/study.py --settings graff-residual   only some of the settings
+    python benchmark/study.py --collect                   report only
 
 Methods, ablations and the start without a pre-grasp, one seed, 0.5M frames, `algo=ppo_fast
 action=residual`; PGDM, the open hand, 15 cm and no pre-grasp also with the paper's actions. Each
-setting is a sweep (`pgdm-run -m`), so that stopping and starting again goes on where it was. What a
-run leaves is stored without checkpoints and films, its training curve thinned, and `pgdm report`
-makes page and tables from that: a run that is stored is not run again, wherever this is started.
+setting is a sweep (`pgdm-run -m`): the same command resumes it. Runs are stored without checkpoints
+and videos, their training curves thinned, and `pgdm report` draws page and tables from that. A
+stored run is not trained again, on whichever machine this is started.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from short_runs import store
+from short_runs import program, report, store
 
 from pgdm.config.suites import suite
-from pgdm.tracking.run_folder import RESULT, find_runs
+from pgdm.runs.files import RESULT
+from pgdm.runs.folder import find_runs
 
 RESULTS = Path(__file__).parent / "results" / "study"
 PICTURE = Path(__file__).parent.parent / "docs" / "images" / "study.png"
@@ -34,7 +34,7 @@ RAMP = f"method.curriculum.ramp_frames={4_000_000 * FRAMES // 50_000_000}"
 
 TASKS = suite("quick6")
 EXPERTS = [task for task in TASKS if task in suite("adroit_experts")]
-"""Tasks whose hand trajectory of an expert is published: DeepMimic and GRAFF* need one."""
+"""Tasks with a published expert hand trajectory: DeepMimic and GRAFF* need one."""
 
 COMMON = (
     "algo=ppo_fast",
@@ -55,7 +55,7 @@ _CHANGES = {
     "graff": (EXPERTS, ("method=graff",)),
     "curriculum": (TASKS, ("method=curriculum", RAMP)),
 }
-# With the paper's actions as well: residual ones cannot bring the wrist back to where it was.
+# With the paper's actions as well: residual ones cannot move the hand back to its pre-grasp.
 _ALSO_ABSOLUTE = ("pgdm", "no_pregrasp", "open_hand", "distance_15cm")
 SETTINGS = {
     f"{name}-{action}": (_CHANGES[name][0], (f"action={action}", *_CHANGES[name][1]))
@@ -73,12 +73,12 @@ def place(setting: str, task: str) -> Path:
 
 
 def run(setting: str, folder: Path) -> int:
-    """Run the tasks of a setting that are not stored, and store what has finished."""
+    """Train the tasks of a setting that are not stored, and store the finished runs."""
     tasks, overrides = SETTINGS[setting]
     missing = [task for task in tasks if not (place(setting, task) / RESULT).exists()]
     if not missing:
         return 0
-    command = [str(Path(sys.executable).with_name("pgdm-run")), "-m", f"task={','.join(missing)}"]
+    command = [program("pgdm-run"), "-m", f"task={','.join(missing)}"]
     command += [*COMMON, *overrides, f"sweep.name={setting}", f"sweep.dir={folder / setting}"]
     code = subprocess.run(command).returncode
     for found in find_runs(folder / setting / "runs"):
@@ -87,8 +87,8 @@ def run(setting: str, folder: Path) -> int:
     return code
 
 
-def figures() -> Rows:
-    """Return of every setting and task success and lifted (a door is not), or why there is none."""
+def measured() -> Rows:
+    """Return success and lifted (None of a door) by setting and task, or why there are none."""
     found: Rows = {}
     for setting, (tasks, _) in SETTINGS.items():
         cells = found.setdefault(setting, [])
@@ -104,7 +104,7 @@ def figures() -> Rows:
 
 
 def table(rows: Rows) -> str:
-    """Return them as a Markdown table."""
+    """Return rows as a Markdown table."""
     lines = [f"| setting | {' | '.join(TASKS)} |", "|---" + "|--:" * len(TASKS) + "|"]
     for setting, cells in rows.items():
         texts = [
@@ -116,7 +116,7 @@ def table(rows: Rows) -> str:
 
 
 def draw(rows: Rows, file: Path) -> None:
-    """Draw success and lifted side by side, darker where more."""
+    """Draw success and lifted side by side, higher values darker."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4.4), layout="constrained")
@@ -146,26 +146,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--runs", type=Path, default=Path("runs/study"))
     parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=list(SETTINGS))
-    parser.add_argument("--collect", action="store_true", help="run nothing")
+    parser.add_argument("--collect", action="store_true", help="train nothing")
     options = parser.parse_args(arguments)
     codes = [] if options.collect else [run(s, options.runs) for s in options.settings]
     stored = len(list((RESULTS / "runs").glob(f"*/*/{RESULT}")))
-    told = f"{stored} of {sum(len(tasks) for tasks, _ in SETTINGS.values())} runs are stored"
-    print(told)
+    title = f"{stored} of {sum(len(tasks) for tasks, _ in SETTINGS.values())} runs are stored"
+    print(title)
     if stored:
-        rows = figures()
+        rows = measured()
         (RESULTS / "README.md").write_text(
-            f"# {told}\n\n`python benchmark/study.py`: one seed, {FRAMES:,} frames (the paper: "
+            f"# {title}\n\n`python benchmark/study.py`: one seed, {FRAMES:,} frames (the paper: "
             "50,000,000), actions sampled; success / lifted. Page, pictures and tables are in "
             f"`report`.\n\n{table(rows)}"
         )
         draw(rows, PICTURE)
-        pgdm = str(Path(sys.executable).with_name("pgdm"))
-        # From there, as the page names the folders that it was given.
-        command = [pgdm, "report", "runs", "--out", "report"]
-        codes.append(subprocess.run(command, cwd=RESULTS).returncode)
+        codes.append(report(RESULTS))
     if any(codes):
-        raise SystemExit(f"something failed (exit codes {codes}); the same command goes on")
+        raise SystemExit(
+            f"a run or the report failed (exit codes {codes}); the same command resumes"
+        )
 
 
 if __name__ == "__main__":

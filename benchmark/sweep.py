@@ -2,10 +2,10 @@
 
     python benchmark/sweep.py [--task hammer-use1] [--write]
 
-The plan is that of the study validate_tcdm50, a process from start to end. The sweep whose status
-is asked for is made up, with two attempts at each job and full-size records. Figures are medians of
+The plan is that of the study validate_tcdm50, timed as a whole process. The sweep whose status is
+queried is synthetic, with two attempts at each job and full-size records. Values are medians of
 five. Shares are of processor time: the driver's of one core, MLflow's of a training of a few
-iterations on one thread, where the thread that talks to MLflow is timed by itself.
+iterations on one thread, where the thread that talks to MLflow is timed separately.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from pathlib import Path
 from typing import Any
 
 from pgdm.cli import main as pgdm
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.experiment import run_experiment
 from pgdm.rl.callback import Callback, Progress
+from pgdm.runs.log import RunLog
+from pgdm.runs.provenance import versions
 from pgdm.sweep.ledger import Ending, Ledger
 from pgdm.sweep.plan import Job, Plan, job_key, write_plan
 from pgdm.sweep.processes import Process
-from pgdm.sweep.state import PARENT, rows
+from pgdm.sweep.status import PARENT, rows
 from pgdm.tracking.live import MlflowTracker
-from pgdm.tracking.provenance import versions
-from pgdm.tracking.run_log import RunLog
 
 RESULT = Path(__file__).parent / "results" / "sweep.json"
 JOBS, ROUNDS = 150, 5
 ITERATIONS = 6
-FRAMES = 1_000_000  # of the run to which what MLflow costs once is set in relation
-LINES = 300  # records at the end of a running job's log, more than anybody reads
+FRAMES = 1_000_000  # of the run over which MLflow's one-time cost is spread
+LINES = 300  # records at the end of a running job's log, more than are ever read
 METRICS = {f"eval_{kind}/metric_{i}": 0.123456789 for kind in ("sampled", "it") for i in range(30)}
 
 
-def made_up(folder: Path, running: int) -> None:
-    """Write a sweep of ``JOBS`` jobs, of which the last ones are running in this process."""
+def synthetic(folder: Path, running: int) -> None:
+    """Write a synthetic sweep of ``JOBS`` jobs, the last ones running in this process."""
     cfg, me = compose(["task=hammer-use1"]), Process.of(os.getpid())
     jobs = []
     for seed in range(JOBS):
@@ -77,7 +77,7 @@ def made_up(folder: Path, running: int) -> None:
 def median_s(
     work: Callable[[], object], times: int = 1, clock: Callable[[], float] = time.perf_counter
 ) -> float:
-    """Return how long one piece of work takes, s."""
+    """Return the time of one piece of work, s."""
     found = []
     for _ in range(ROUNDS):
         start = clock()
@@ -88,7 +88,7 @@ def median_s(
 
 
 def ledger_costs(folder: Path) -> dict[str, float]:
-    """Measure the ledger of a made-up sweep with two running jobs."""
+    """Measure the ledger of a synthetic sweep with two running jobs."""
     ledger, me = Ledger(folder), Process.of(os.getpid())
     key = next(iter(ledger.states()))
 
@@ -101,13 +101,13 @@ def ledger_costs(folder: Path) -> dict[str, float]:
     show_s = median_s(lambda: rows(ledger), 5, time.process_time)
     return {
         "attempt_ms": 1000 * median_s(attempt, 5),
-        # The driver looks five times a second, and shows every other second.
+        # The driver reads the states five times a second, and shows them every other second.
         "driver_share_of_a_core": 5 * look_s + show_s / 2,
     }
 
 
 def status_s(folder: Path) -> float:
-    """Measure ``pgdm sweep status``, its imports done."""
+    """Measure ``pgdm sweep status``, without its imports."""
 
     def status() -> None:
         with contextlib.redirect_stdout(io.StringIO()):
@@ -196,26 +196,26 @@ def mlflow_costs(task: str, folder: Path) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure, print, and store the figures if asked to."""
+    """Measure, print, and store the values if wanted."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="hammer-use1")
-    parser.add_argument("--write", action="store_true", help=f"store the figures in {RESULT.name}")
+    parser.add_argument("--write", action="store_true", help=f"store the values in {RESULT.name}")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
-        made_up(root / "two", 2)
-        made_up(root / "all", JOBS)
-        figures = {
+        synthetic(root / "two", 2)
+        synthetic(root / "all", JOBS)
+        values = {
             "planning_150_s": planning_s(),
             "status_of_150_s": status_s(root / "two"),
             "status_of_150_running_s": status_s(root / "all"),
             **ledger_costs(root / "two"),
             **mlflow_costs(options.task, root),
         }
-    figures["ledger_and_mlflow_share"] = figures["mlflow_share"] + figures[
+    values["ledger_and_mlflow_share"] = values["mlflow_share"] + values[
         "driver_share_of_a_core"
     ] / len(os.sched_getaffinity(0))
-    for name, value in figures.items():
+    for name, value in values.items():
         print(f"{name:<28}{value:.4g}")
     if options.write:
         whole = {
@@ -223,7 +223,7 @@ def main() -> None:
             "date": date.today().isoformat(),
             "machine": {"cores": len(os.sched_getaffinity(0)), "processor": platform.machine()},
             "versions": versions(),
-            "figures": {name: float(f"{value:.4g}") for name, value in figures.items()},
+            "figures": {name: float(f"{value:.4g}") for name, value in values.items()},
         }
         RESULT.parent.mkdir(exist_ok=True)
         RESULT.write_text(json.dumps(whole, indent=1) + "\n")

@@ -1,28 +1,28 @@
 """All 50 tasks of the benchmark with the recommended settings; stores runs and page.
 
     pgdm-run -m +experiment=fast task=tcdm50 seed=0 sweep.name=tcdm50      train (10 to 20 hours)
-    python benchmark/tcdm50.py runs/sweeps/tcdm50      store what has finished by now, and report
+    python benchmark/tcdm50.py runs/sweeps/tcdm50      store the runs finished by now, and report
 
-Training and storing are apart, so that results are stored while a sweep goes on. Finished runs of
-`+experiment=fast` are taken from any folders that are given, whatever else is in them.
+Results can be stored while the sweep is running. Finished runs of `+experiment=fast` are taken from
+any folders given, whatever else these contain.
 """
 
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from short_runs import store
+from short_runs import report, store
 
+from pgdm.config.compose import compose
 from pgdm.config.identity import identity_hash
 from pgdm.config.saved import load_config
-from pgdm.config.store import compose
 from pgdm.config.suites import suite
-from pgdm.tracking.run_folder import RESULT, WRIST_BOUND, RunFolder, find_runs, read_json
+from pgdm.runs.files import RESULT, read_json
+from pgdm.runs.folder import RunFolder, find_runs
+from pgdm.runs.result import WRIST_BOUND
 
 RESULTS = Path(__file__).parent / "results" / "tcdm50"
 TASKS = suite("tcdm50")
@@ -34,7 +34,7 @@ def place(task: str, seed: int) -> Path:
 
 
 def wanted(found: RunFolder) -> bool:
-    """Return whether a run has finished with these settings, longer than what is stored of it."""
+    """Return whether a run has finished with these settings and more frames than the stored one."""
     task = found.config.get("task", {}).get("id")
     if found.status() != "finished" or task not in TASKS:
         return False
@@ -49,8 +49,8 @@ def wanted(found: RunFolder) -> bool:
 def table(rows: dict[Path, dict[str, Any]]) -> str:
     """Return stored results as a Markdown table, worst first."""
     lines = [
-        "| task | seed | frames | minutes | success, sampled | deterministic | lifted | bound "
-        "| paper |",
+        "| task | seed | frames | minutes | success, sampled | deterministic | lifted "
+        "| rigid grasp | paper |",
         "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for folder, row in sorted(rows.items(), key=lambda r: r[1]["metrics"]["eval_sampled/success"]):
@@ -68,11 +68,11 @@ def table(rows: dict[Path, dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Store what has finished, then report."""
+    """Store the finished runs, then report."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folders", nargs="*", type=Path, help="where runs are, at any depth")
+    parser.add_argument("folders", nargs="*", type=Path, help="with runs, at any depth")
     for folder in parser.parse_args().folders:
         for found in find_runs(folder):
             if wanted(found):
@@ -82,19 +82,19 @@ def main() -> None:
     files = sorted((RESULTS / "runs").glob(f"*/{RESULT}"))
     rows = {file.parent: read_json(file) for file in files}
     tasks = {load_config(folder).task.id for folder in rows}
-    told = f"{len(tasks)} of {len(TASKS)} tasks, {len(rows)} runs"
+    title = f"{len(tasks)} of {len(TASKS)} tasks, {len(rows)} runs"
     if rows:
         success = mean(row["metrics"]["eval_sampled/success"] for row in rows.values())
-        told += f", mean sampled success {success:.1%}"
+        title += f", mean sampled success {success:.1%}"
         (RESULTS / "README.md").write_text(
-            f"# {told}\n\n`+experiment=fast`; not comparable with the paper (50,000,000 "
-            "frames, 3 seeds). Bound: success of the hand alone on its planned way. "
+            f"# {title}\n\n`+experiment=fast`; not comparable with the paper (50,000,000 "
+            "frames, 3 seeds). Rigid grasp: what a grasp that never slips would reach with the "
+            "planned commands. "
             f"Page, curves and tables are in `report`.\n\n{table(rows)}"
         )
-        pgdm = str(Path(sys.executable).with_name("pgdm"))
-        # From there, as the page names the folders that it was given.
-        subprocess.run([pgdm, "report", "runs", "--out", "report"], cwd=RESULTS, check=True)
-    print(told)
+    print(title)
+    if rows and (code := report(RESULTS)):
+        raise SystemExit(code)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,15 @@
-"""Speed of pgdm: stepping, training, start and memory. Prints one table, medians of five.
+"""Speed of pgdm: stepping, training, start-up and memory. Prints one table, medians of five rounds.
 
     python benchmark/throughput.py [--task hammer-use1] [--rounds 5] [--write] [--methods-only]
+    python benchmark/throughput.py --against OTHER_CHECKOUT [--task hammer-use1] [--rounds 5]
 
-Beside everything runs bare ``mujoco.batch.Batch`` doing the very same steps (targets, gravity
-compensation, restarts, from the same states) with nothing around it: step by step beside the batch
-env, and after each iteration of a training that iteration's steps again, so that the machine's
-drift hits both alike.
+The baseline is bare ``mujoco.batch.Batch`` doing the very same steps (targets, gravity
+compensation, restarts, from the same states) with nothing around it: in turn with each step of the
+batch env, and repeating each iteration's steps right after it in a training, so that drift of the
+machine's speed affects both alike.
+
+With ``--against``, this checkout and another one, such as the code before a change, are measured in
+turn, each round in a new process. Both are measured by this file, so only by what they share.
 """
 
 from __future__ import annotations
@@ -31,29 +35,22 @@ from method_cost import measure_methods
 from mujoco import batch as mujoco_batch
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
-from torchrl_loss import as_tensordict, clip_ppo_loss
 
+import pgdm
+from pgdm.config.compose import compose
 from pgdm.config.schema import ExperimentCfg
-from pgdm.config.store import compose
 from pgdm.envs.batch_env import BatchEnv
 from pgdm.envs.build import EnvBuilder
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
 from pgdm.rl.callback import Callback, Progress
-from pgdm.rl.loss import Samples, policy_loss, value_loss
-from pgdm.rl.networks import (
-    ActionValue,
-    ActorCritic,
-    NetworkCfg,
-    SquashedCfg,
-    SquashedPolicy,
-    gaussian_log_prob,
-)
-from pgdm.rl.sac import SACCfg
-from pgdm.rl.sac_loss import SoftActorCriticLoss, TensorDict
 from pgdm.rl.trainer import Extras, Trainer, TrainerCfg
-from pgdm.tracking.provenance import versions
+from pgdm.runs.provenance import versions
+from pgdm.sim.batch import Array
+
+HERE = Path(__file__).resolve().parents[1]
+sys.path.append(str(HERE / "tests"))
+from toy_envs import FreeEnv  # noqa: E402
 
 RESULT = Path(__file__).parent / "results" / "throughput.json"
 NUM_ENVS = 64  # simulations of the batch env; a training has as many as its settings say
@@ -81,26 +78,26 @@ class Script:
 
 
 class Recorder:
-    """Writes down what an env asks of its simulations."""
+    """Records what an env does with its simulations."""
 
     def __init__(self, env: BatchEnv) -> None:
         self._sim, self._step, self._reset = env.sim, env.sim.step, env.sim.reset
-        self.script = Script(env.sim.rows.copy())
-        # The env's own calls pass through here: two list entries a step, some microseconds.
+        self.script = Script(np.array(env.sim.rows))
+        # The env's own calls pass through here: two list entries a step, a few microseconds.
         env.sim.step, env.sim.reset = self._on_step, self._on_reset
 
     def start(self) -> None:
         """Begin a new script."""
-        self.script = Script(self._sim.rows.copy())
+        self.script = Script(np.array(self._sim.rows))
 
-    def _on_step(self, ctrl: np.ndarray) -> np.ndarray:
-        self.script.targets.append(ctrl.copy())
+    def _on_step(self, ctrl: Array) -> Array:
+        self.script.targets.append(np.array(ctrl))
         self.script.restarted.append(np.zeros(0, np.int64))
         return self._step(ctrl)
 
-    def _on_reset(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
+    def _on_reset(self, ids: Array, qpos: np.ndarray, qvel: np.ndarray) -> None:
         if self.script.restarted:  # the reset before the first step is in the states
-            self.script.restarted[-1] = ids.copy()
+            self.script.restarted[-1] = np.array(ids)
         self._reset(ids, qpos, qvel)
 
 
@@ -134,7 +131,7 @@ class Bare:
 
 
 def play(script: Script, builder: EnvBuilder) -> tuple[float, np.ndarray]:
-    """Do it again with the bare physics; return s, and the states (N, nstate) it ended in."""
+    """Repeat a script with the bare physics; return s, and the final states (N, nstate)."""
     bare = Bare(builder, script.states)
     start = time.perf_counter()
     for target, restarted in zip(script.targets, script.restarted, strict=True):
@@ -146,7 +143,7 @@ def step_side_by_side(builder: EnvBuilder, num_envs: int) -> tuple[float, float]
     """Step env and bare physics in turn, one control step each; return s of both."""
     generator = torch.Generator().manual_seed(0)
     env = builder.make(num_envs)
-    recorder, bare = Recorder(env), Bare(builder, env.sim.rows)
+    recorder, bare = Recorder(env), Bare(builder, np.array(env.sim.rows))
     in_env = in_bare = 0.0
     for _ in range(STEPS):
         noise = torch.randn((num_envs, env.action_dim), generator=generator)
@@ -163,7 +160,7 @@ def step_side_by_side(builder: EnvBuilder, num_envs: int) -> tuple[float, float]
 
 
 class Clock(Callback):
-    """Takes the time of each iteration, and that of its steps with the bare physics after it."""
+    """Times each iteration, and then its steps with the bare physics."""
 
     def __init__(self, builder: EnvBuilder, env: BatchEnv) -> None:
         self._builder, self._env, self._recorder = builder, env, Recorder(env)
@@ -176,7 +173,7 @@ class Clock(Callback):
         self._begin()
 
     def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
-        """Note the iteration's time, and that of the bare physics."""
+        """Record the time of the iteration and of the bare physics."""
         self.training_s.append(time.perf_counter() - self._since)
         seconds, states = play(self._recorder.script, self._builder)
         if not np.array_equal(states, self._env.sim.rows):
@@ -192,8 +189,8 @@ class Clock(Callback):
 def train(builder: EnvBuilder, cfg: ExperimentCfg, overlap: bool = True) -> tuple[float, float]:
     """Return steps/s of collecting and learning, and of the bare physics doing the same steps.
 
-    Evaluation and saving are left out; the first iteration warms up. Without ``overlap`` soft
-    actor-critic learns while no simulation moves; each then has the machine to itself.
+    Evaluation and saving are left out; the first iteration is a warm-up. Without ``overlap`` soft
+    actor-critic learns while no simulation steps; each then has the machine to itself.
     """
     threads = len(os.sched_getaffinity(0))
     frames = cfg.num_envs * cfg.algo.steps_per_env
@@ -207,78 +204,24 @@ def train(builder: EnvBuilder, cfg: ExperimentCfg, overlap: bool = True) -> tupl
     return done / sum(clock.training_s[1:]), done / sum(clock.bare_s[1:])
 
 
-def gradient_step_ms(cfg: ExperimentCfg) -> tuple[float, float]:
-    """Return ms of one minibatch's loss and gradient: pgdm's, and TorchRL's ``ClipPPOLoss``."""
-    generator = torch.Generator().manual_seed(0)
-    algo, obs_dim, action_dim = cfg.algo, 322, 30
-    network = NetworkCfg(obs_dim, action_dim, list(algo.hidden), algo.log_std_init, False, 10.0)
-    model = ActorCritic(network, generator)
-    obs = torch.randn(algo.minibatch_size, obs_dim, generator=generator)
-    action, mean = model.sample(obs, generator)
-    log_prob = gaussian_log_prob(mean, model.log_std.detach(), action)
-    advantage, target = torch.randn((2, algo.minibatch_size), generator=generator)
-    batch = Samples(obs, action, log_prob, advantage, target)
-    theirs = clip_ppo_loss(model, algo)
-    data = as_tensordict(batch, theirs)
+class Ticks(Callback):
+    """Records when each iteration was done."""
 
-    def ours() -> Tensor:
-        policy = policy_loss(
-            model.mean(obs),
-            model.log_std,
-            batch,
-            clip=algo.clip,
-            entropy_coef=algo.entropy_coef,
-            normalize_advantage=algo.normalize_advantage,
-        )
-        return policy.total + algo.value_coef * value_loss(model.value(obs), target)
+    def __init__(self) -> None:
+        self.at_s: list[float] = []
 
-    def torchrls() -> Tensor:
-        out = theirs(data)
-        return out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]
-
-    spent = {ours: 0.0, torchrls: 0.0}
-    for _ in range(STEPS):
-        for loss in spent:
-            model.zero_grad()
-            start = time.perf_counter()
-            loss().backward()
-            spent[loss] += time.perf_counter() - start
-    return 1e3 * spent[ours] / STEPS, 1e3 * spent[torchrls] / STEPS
+    def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
+        """Record the time."""
+        self.at_s.append(time.perf_counter())
 
 
-def critic_gradient_ms(cfg: ExperimentCfg) -> tuple[float, float]:
-    """Return ms of one batch's critic loss and gradient, critics one by one and under vmap."""
-    algo, generator = cfg.algo, torch.Generator().manual_seed(0)
-    assert isinstance(algo, SACCfg)
-    m, obs_dim, action_dim = algo.batch_size, 322, 30
-    network = SquashedCfg("squashed", obs_dim, action_dim, list(algo.hidden), -1.6, 10.0)
-    policy = SquashedPolicy(network, generator)
-    critics = [ActionValue(obs_dim, action_dim, algo.hidden, generator) for _ in range(2)]
-    after = {name: torch.zeros(m, 1, dtype=torch.bool) for name in ("done", "terminated")}
-    after |= {"observation": torch.randn(m, obs_dim), "reward": torch.rand(m, 1)}
-    columns = {"observation": torch.randn(m, obs_dim), "action": torch.rand(m, action_dim)}
-    batch = TensorDict({**columns, "next": TensorDict(after, batch_size=m)}, batch_size=m)
-    spent = []
-    for vmap in (False, True):
-        loss = SoftActorCriticLoss(
-            policy,
-            critics,
-            gamma=algo.gamma,
-            temperature=0.01,
-            target_entropy=-30.0,
-            generator=generator,
-        )
-        loss.deactivate_vmap = not vmap
-        loss._make_vmap()
-        params, times = list(loss.qvalue_network_params.parameters()), []
-        for _ in range(STEPS):
-            start = time.perf_counter()
-            with torch.autocast("cpu", dtype=torch.bfloat16, enabled=algo.bfloat16):
-                value = loss.critic_loss(batch)
-            torch.autograd.grad(value, params)
-            times.append(time.perf_counter() - start)
-        spent.append(1e3 * statistics.median(times))
-    return spent[0], spent[1]
+def without_physics_ms(cfg: ExperimentCfg) -> float:
+    """Return ms of an iteration whose simulations cost nothing: acting and learning alone."""
+    threads, ticks = len(os.sched_getaffinity(0)), Ticks()
+    frames = cfg.num_envs * cfg.algo.steps_per_env * (ITERATIONS + 2)  # two of them as a warm-up
+    trainer_cfg = TrainerCfg(cfg.algo, 0, frames, None, 0, 1e9, "cpu", threads)
+    Trainer(FreeEnv(cfg.num_envs), trainer_cfg, Extras(callbacks=[ticks])).run()
+    return 1e3 * float(np.median(np.diff(ticks.at_s[1:])))
 
 
 def first_step_s(task: str) -> float:
@@ -289,9 +232,9 @@ def first_step_s(task: str) -> float:
 
 
 def peak_memory_mib(task: str, *overrides: str) -> float:
-    """Return the largest resident memory of a short `pgdm-run` with a film.
+    """Return the peak resident memory of a short `pgdm-run` with a video.
 
-    The pages of a replay that are in memory count; the system takes them back when it needs them.
+    Pages of a replay that are in memory count; the system reclaims them when it needs them.
     """
     with tempfile.TemporaryDirectory() as folder:
         command = [str(Path(sys.executable).with_name("pgdm-run")), f"task={task}", "--offline"]
@@ -300,61 +243,112 @@ def peak_memory_mib(task: str, *overrides: str) -> float:
     return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
 
 
-def measure(task: str, rounds: int, console: Console) -> dict[str, list[float]]:
-    """Return each figure's value in every round."""
+def measure_round(task: str) -> dict[str, float]:
+    """Return one value of each row that any checkout has."""
     # torch's helper threads spin after each parallel call, on a core that the physics needs.
     torch.set_num_threads(1)
     builder = env_builder(compose([f"task={task}"]), open_library())
-    figures: dict[str, list[float]] = {}
+    in_env, in_bare = step_side_by_side(builder, NUM_ENVS)
+    values = {
+        "bare": STEPS * NUM_ENVS / in_bare,
+        "make_batch": STEPS * NUM_ENVS / in_env,
+        "make_batch / bare": in_bare / in_env,
+    }
+    for algo, overlap in (("ppo", True), ("ppo_fast", True), ("sac", True), ("sac", False)):
+        cfg = compose([f"task={task}", f"algo={algo}"])
+        trained, bare = train(builder, cfg, overlap)
+        name = algo if overlap else f"{algo}, physics and updates in turn"
+        values[f"training {name}"] = trained
+        values[f"bare, the steps of training {name}"] = bare
+        values[f"training {name} / bare"] = trained / bare
+    for algo in ("ppo", "ppo_fast", "sac"):
+        cfg = compose([f"task={task}", f"algo={algo}"])
+        values[f"an iteration of {algo} without physics (ms)"] = without_physics_ms(cfg)
+    values["import to first step (s)"] = first_step_s(task)
+    values["peak memory of a run (MiB)"] = peak_memory_mib(task)
+    values["peak memory of a run with algo=sac (MiB)"] = peak_memory_mib(task, "algo=sac")
+    return values
 
-    def note(name: str, value: float) -> None:
-        figures.setdefault(name, []).append(value)
 
+def measure(task: str, rounds: int, console: Console) -> dict[str, list[float]]:
+    """Return the values of each row, one per round."""
+    from loss_cost import measure_losses  # of parts that another checkout may not have
+
+    values: dict[str, list[float]] = {}
     for number in range(rounds):
         with console.status(f"round {number + 1} of {rounds}"):
-            in_env, in_bare = step_side_by_side(builder, NUM_ENVS)
-            note("bare", STEPS * NUM_ENVS / in_bare)
-            note("make_batch", STEPS * NUM_ENVS / in_env)
-            note("make_batch / bare", in_bare / in_env)
-            for algo, overlap in (("ppo", True), ("ppo_fast", True), ("sac", True), ("sac", False)):
-                cfg = compose([f"task={task}", f"algo={algo}"])
-                trained, bare = train(builder, cfg, overlap)
-                name = algo if overlap else f"{algo}, physics and updates in turn"
-                note(f"training {name}", trained)
-                note(f"bare, the steps of training {name}", bare)
-                note(f"training {name} / bare", trained / bare)
-            one_by_one, under_vmap = critic_gradient_ms(compose([f"task={task}", "algo=sac"]))
-            note("loss and gradient of SAC's critics, one thread (ms)", one_by_one)
-            note("the same under TorchRL's vmap (ms)", under_vmap)
-            own, torchrls = gradient_step_ms(compose([f"task={task}"]))
-            note("loss and gradient, one thread (ms)", own)
-            note("the same by TorchRL's ClipPPOLoss (ms)", torchrls)
-            note("import to first step (s)", first_step_s(task))
-            note("peak memory of a run (MiB)", peak_memory_mib(task))
-            note("peak memory of a run with algo=sac (MiB)", peak_memory_mib(task, "algo=sac"))
-    return figures
+            for name, value in (measure_round(task) | measure_losses(task)).items():
+                values.setdefault(name, []).append(value)
+    return values
+
+
+def compare(task: str, rounds: int, other: Path, console: Console) -> None:
+    """Measure this checkout and another in turn and print both."""
+    checkouts = {"other": other.resolve(), "this": HERE}
+    found: dict[str, dict[str, list[float]]] = {name: {} for name in checkouts}
+    for number in range(rounds):
+        for name in list(checkouts)[:: 1 - 2 * (number % 2)]:  # the first one changes
+            with console.status(f"round {number + 1} of {rounds}, {name}"):
+                for row, value in in_checkout(checkouts[name], task).items():
+                    found[name].setdefault(row, []).append(value)
+    table = Table(title=f"{task}, N={NUM_ENVS}, {os.cpu_count()} cores, medians of {rounds}")
+    table.add_column("")
+    for name in (*checkouts, "this / other", "min", "max"):
+        table.add_column(name, justify="right")
+    for row, before in found["other"].items():
+        after = found["this"][row]
+        ratios = [new / old for new, old in zip(after, before, strict=True)]
+        shown = [f"{statistics.median(values):,.{digits(row)}f}" for values in (before, after)]
+        spread = (statistics.median(ratios), min(ratios), max(ratios))
+        table.add_row(row, *shown, *(f"{ratio:.3f}" for ratio in spread))
+    console.print(table)
+
+
+def in_checkout(checkout: Path, task: str) -> dict[str, float]:
+    """Return a round's values, measured in a new process with the package of a checkout."""
+    command = [sys.executable, str(Path(__file__).resolve()), "--task", task, "--one-round"]
+    place = os.environ | {"PYTHONPATH": str(checkout / "src")}
+    done = subprocess.run(command, env=place, stdout=subprocess.PIPE, text=True, check=True)
+    package, values = json.loads(done.stdout.splitlines()[-1])
+    if not Path(package).is_relative_to(checkout):
+        raise SystemExit(f"measured {package}, which is not in {checkout}")
+    return values
+
+
+def digits(row: str) -> int:
+    """Return the decimals to show in a row."""
+    return 2 if "/ bare" in row or "/ pgdm" in row or "s)" in row else 0
 
 
 def main() -> None:
     """Measure, print, store."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", default="hammer-use1")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--write", action="store_true", help=f"store the figures in {RESULT.name}")
+    parser.add_argument("--write", action="store_true", help=f"store the values in {RESULT.name}")
     parser.add_argument("--methods-only", action="store_true", help="only the methods' rows")
+    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="compare with another one")
+    parser.add_argument("--one-round", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.write and options.methods_only:
-        parser.error("--write stores all figures; leave --methods-only out")
+    if options.write and (options.methods_only or options.against):
+        parser.error("--write stores all values of this checkout; use it alone")
     console = Console()
-    figures = {} if options.methods_only else measure(options.task, options.rounds, console)
-    figures |= measure_methods(options.task, NUM_ENVS, options.rounds, console)
-    table = Table(title=f"{options.task}, N=64, {os.cpu_count()} cores")
-    for name in ("figure", "median", "min", "max"):
-        table.add_column(name, justify="left" if name == "figure" else "right")
-    for name, values in figures.items():
-        digits = 2 if "/ bare" in name or "/ pgdm" in name or "s)" in name else 0
-        row = (statistics.median(values), min(values), max(values))
-        table.add_row(name, *(f"{value:,.{digits}f}" for value in row))
+    if options.one_round:
+        print(json.dumps([str(Path(pgdm.__file__).resolve()), measure_round(options.task)]))
+        return
+    if options.against:
+        compare(options.task, options.rounds, options.against, console)
+        return
+    values = {} if options.methods_only else measure(options.task, options.rounds, console)
+    values |= measure_methods(options.task, NUM_ENVS, options.rounds, console)
+    table = Table(title=f"{options.task}, N={NUM_ENVS}, {os.cpu_count()} cores")
+    for name in ("", "median", "min", "max"):
+        table.add_column(name, justify="right" if name else "left")
+    for row, found in values.items():
+        shown = (statistics.median(found), min(found), max(found))
+        table.add_row(row, *(f"{value:,.{digits(row)}f}" for value in shown))
     console.print(table)
     if options.write:
         about = {
@@ -364,7 +358,7 @@ def main() -> None:
             "task": options.task,
             "versions": versions(),
         }
-        RESULT.write_text(json.dumps(about | {"figures": figures}, indent=1) + "\n")
+        RESULT.write_text(json.dumps(about | {"figures": values}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

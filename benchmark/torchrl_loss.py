@@ -1,23 +1,18 @@
-"""TorchRL's ``ClipPPOLoss`` over pgdm's networks, to set pgdm's own loss beside it."""
+"""TorchRL's own ``ClipPPOLoss`` with pgdm's networks, for comparison with pgdm's subclass."""
 
 from __future__ import annotations
 
-import warnings
-from typing import TYPE_CHECKING
-
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import ClipPPOLoss
 
-from pgdm.rl.loss import Samples
 from pgdm.rl.networks import ActorCritic
 from pgdm.rl.ppo import PPOCfg
 
-if TYPE_CHECKING:
-    from tensordict import TensorDict
-    from torchrl.objectives import ClipPPOLoss
-
 
 class _LocScale(nn.Module):
-    """The policy in the form that TorchRL's distributions take."""
+    """The policy in the form that TorchRL's distributions expect."""
 
     def __init__(self, model: ActorCritic) -> None:
         super().__init__()
@@ -29,20 +24,18 @@ class _LocScale(nn.Module):
 
 
 def clip_ppo_loss(model: ActorCritic, cfg: PPOCfg) -> ClipPPOLoss:
-    """Return TorchRL's loss of a model, with the settings of ``cfg``."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from tensordict.nn import TensorDictModule
-        from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
-        from torchrl.objectives import ClipPPOLoss
+    """Return TorchRL's loss of a model, with the settings of ``cfg``.
 
+    Its samples [M] hold ``observation``, ``action``, ``action_log_prob``, ``advantage`` (M, 1) and
+    ``value_target`` (M, 1).
+    """
     actor = ProbabilisticActor(
         TensorDictModule(_LocScale(model), ["observation"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
     )
-    return ClipPPOLoss(
+    loss = ClipPPOLoss(
         actor,
         ValueOperator(model.critic, in_keys=["observation"]),
         clip_epsilon=cfg.clip,
@@ -56,19 +49,5 @@ def clip_ppo_loss(model: ActorCritic, cfg: PPOCfg) -> ClipPPOLoss:
         reduction="mean",
         functional=False,
     )
-
-
-def as_tensordict(batch: Samples, loss: ClipPPOLoss) -> TensorDict:
-    """Return a minibatch in the form that the loss takes."""
-    from tensordict import TensorDict
-
-    return TensorDict(
-        {
-            "observation": batch.obs,
-            "action": batch.action,
-            loss.tensor_keys.sample_log_prob: batch.log_prob,
-            "advantage": batch.advantage[:, None],
-            "value_target": batch.target[:, None],
-        },
-        batch_size=[len(batch.obs)],
-    )
+    loss.set_keys(sample_log_prob="action_log_prob")
+    return loss

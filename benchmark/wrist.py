@@ -1,11 +1,11 @@
 """How closely the hand can follow each motion: by geometry, and simulated without the object.
 
     python benchmark/wrist.py                plan what is missing of all 51 tasks, print the table
-    python benchmark/wrist.py quick6         of a suite
+    python benchmark/wrist.py quick6         only the tasks of a suite
     python benchmark/wrist.py --table        print the table of what is stored
 
-Results are stored task by task in results/wrist.json; plans also go to the library, where trainings
-find them. Run it on an idle machine if the times are to mean something.
+Results are stored task by task in results/wrist.json; plans are stored in the library, where
+runs find them. Times are comparable only if the machine is idle.
 """
 
 from __future__ import annotations
@@ -20,12 +20,14 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.config.suites import suite
 from pgdm.envs.build import EnvBuilder
 from pgdm.experiment import assets, env_builder
-from pgdm.tracking.run_folder import read_json, write_json
-from pgdm.wrist.path import clipped_path, feasible_path
+from pgdm.motion.reference import ObjectReference
+from pgdm.runs.files import read_json, write_json
+from pgdm.sim.scene import SceneIndex
+from pgdm.wrist.path import SLIDES, GraspPoint, base_orientation, clipped_path, feasible_path
 from pgdm.wrist.plan import WristPlan
 
 RESULTS = Path(__file__).parent / "results" / "wrist.json"
@@ -39,7 +41,7 @@ def key(task: str) -> str:
 
 
 def measure(task: str) -> dict[str, Any]:
-    """Return a task's figures: distances in mm, angles in rad, shares, times in s."""
+    """Return a task's values: distances in mm, bounds as shares, times in s."""
     cfg = compose([f"task={task}", "+experiment=fast"])
     free = replace(cfg, action=replace(cfg.action, hold_steps=0))
     builder, unheld = (env_builder(c, assets(c, print), print) for c in (cfg, free))
@@ -47,48 +49,58 @@ def measure(task: str) -> dict[str, Any]:
     return {
         "steps": len(builder.wrist.error_m),
         **geometry(builder),
-        "planned": figures(unheld.wrist),
-        "held": figures(builder.wrist),
+        "planned": reached(unheld.wrist),
+        "held": reached(builder.wrist),
         "hold_steps": cfg.action.hold_steps,
         "paper_success": cfg.task.paper_success,
     }
 
 
 def geometry(builder: EnvBuilder) -> dict[str, float]:
-    """Return how far clipped and feasible path have the grasp point from the motion, on average."""
+    """Return the grasp point's mean distance from the motion on the clipped and feasible path."""
     index, reference = builder.scene.index, builder.mdp.reference
     start = torch.from_numpy(builder.mdp.start.qpos)
-    mount = Rotation.from_quat(index.mount_quat, scalar_first=True)
-    targets = mount.inv().apply(reference.pos.numpy() - index.mount_pos)
-    grasp = _turns(start[None].numpy())[0].inv().apply(targets[0] - start[:3].numpy())
     result = {}
     for name, path_of in (("clipped", clipped_path), ("feasible", feasible_path)):
         path = path_of(index, reference, start).numpy()
-        off = np.linalg.norm(path[:, :3] + _turns(path).apply(grasp) - targets, axis=1)
+        off = grasp_errors(index, reference, start.numpy(), path)
         result[f"{name}_mm"] = round(1e3 * float(off.mean()), 1)
     return result
 
 
-def _turns(joints: np.ndarray) -> Rotation:
-    return Rotation.from_euler("XYZ", joints[:, 3:6])
+def grasp_errors(
+    index: SceneIndex, reference: ObjectReference, start: np.ndarray, path: np.ndarray
+) -> np.ndarray:
+    """Return the grasp point's distance from the motion on a path, (T,) m.
+
+    Args:
+        index: of the scene.
+        reference: the exemplar motion.
+        start: qpos (nq,) at the start.
+        path: base joints (T, 6), m and rad.
+    """
+    mount = Rotation.from_quat(index.mount_quat, scalar_first=True)
+    targets = mount.inv().apply(reference.pos.numpy() - index.mount_pos)  # in the mount's frame
+    grasp = GraspPoint.at(targets[0], start[:SLIDES], base_orientation(start))
+    return np.linalg.norm(grasp.of(path[:, :SLIDES], base_orientation(path)) - targets, axis=1)
 
 
-def figures(plan: WristPlan) -> dict[str, float]:
+def reached(plan: WristPlan) -> dict[str, float]:
     """Return what the hand alone reaches with a plan."""
     return {
         "mean_mm": round(1e3 * float(plan.error_m.mean()), 1),
         "max_mm": round(1e3 * float(plan.error_m.max()), 1),
-        "bound": round(plan.bound, 3),
+        "bound": round(plan.rigid_grasp, 3),
         "frames": plan.frames,
         "seconds": round(plan.seconds, 1),
     }
 
 
 def table(stored: dict[str, Any]) -> str:
-    """Return the stored figures as a table in Markdown, worst bound first."""
+    """Return the stored results as a Markdown table, lowest `planned` rigid grasp first."""
     lines = [
-        "| task | steps | `clipped`, `feasible`: mean [mm] | `planned`: mean, largest [mm] | bound "
-        "| with the hold | paper |",
+        "| task | steps | `clipped`, `feasible`: mean [mm] | `planned`: mean, largest [mm] "
+        "| rigid grasp | with the hold | paper |",
         "|---|--:|--:|--:|--:|--:|--:|",
     ]
     for task, row in sorted(stored.items(), key=lambda item: item[1]["planned"]["bound"]):

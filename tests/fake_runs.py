@@ -12,7 +12,8 @@ import pytest
 import yaml
 from PIL import Image
 
-from pgdm.tracking import RunFolder, RunLog
+from pgdm.runs.folder import RunFolder
+from pgdm.runs.log import RunLog
 from pgdm.tracking.mlflow import Store, store_uri
 
 STEP = 4096

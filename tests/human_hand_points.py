@@ -1,4 +1,4 @@
-"""A plausible human right hand, made up."""
+"""A plausible, invented human right hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes that the labeler's tests pose hands in, compiled once."""
+"""Scenes for the labeler's tests, each compiled once."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.envs.build import EnvBuilder
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
 from pgdm.pregrasp.labeler import shapes
 from pgdm.pregrasp.labeler.page import LabelPage
+from pgdm.pregrasp.labeler.poses import Draft, Poses
 from pgdm.pregrasp.labeler.shapes import Shape
 from pgdm.pregrasp.labeler.state import LabelState
-from pgdm.pregrasp.labeler.store import Draft, Poses
 
 
 @cache
@@ -31,19 +31,19 @@ def poses_of(task: str, hand: str | None = None) -> Poses:
 
 
 def state_of(task: str, origin: str = "planned", hand: str | None = None) -> LabelState:
-    """Return a pose to work on."""
+    """Return a pose to edit."""
     return LabelState(built(task, hand).scene, poses_of(task, hand).load(origin).qpos)
 
 
 @cache
 def looks(task: str) -> tuple[list[Shape], list[Shape]]:
-    """Return what is seen of a task's scene, and what contacts are computed with."""
+    """Return the visible and the collision shapes of a task's scene."""
     return shapes.visible(built(task).scene), shapes.solid(built(task).scene)
 
 
 @contextmanager
 def page_of(task: str, origin: str = "planned") -> Iterator[LabelPage]:
-    """Serve a labeler, while inside."""
+    """Serve a labeler inside the context."""
     builder, poses = built(task), poses_of(task)
     draft = Draft(builder.scene)
     page = LabelPage(

@@ -1,4 +1,4 @@
-"""Runs of a few tasks and settings, and the report on them."""
+"""Fabricated runs of a few tasks and settings, and the report on them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from pgdm.config.store import compose_plain
+from pgdm.config.compose import compose_plain
 from pgdm.report.page import write_report
 from pgdm.report.runs import ERROR, METRICS, SUCCESS, Run
 from pgdm.report.settings import Setting
-from pgdm.tracking import RunFolder, RunLog
+from pgdm.runs.folder import RunFolder
+from pgdm.runs.log import RunLog
 
 FRAMES = 40_960
 
@@ -28,7 +29,7 @@ def make(
     success: float,
     *overrides: str,
     state: str = "finished",
-    told: Mapping[str, Any] | None = None,
+    result: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> RunFolder:
     """Write a run whose last evaluation has a success, sampled; the mean action has 0.1 more.
@@ -37,9 +38,9 @@ def make(
         path: its folder.
         success: of the last of four evaluations; the first has none.
         overrides: settings, as for ``pgdm-run``; the task must be one of them.
-        state: what ``result.json`` says; ``running`` has none.
-        told: what ``result.json`` says besides, or instead.
-        changes: of top-level keys, whatever ``conf/`` knows of them.
+        state: status in ``result.json``; a ``running`` run has no such file.
+        result: more keys of ``result.json``.
+        changes: of top-level keys of the configuration, known or not.
     """
     config = compose_plain([f"total_frames={FRAMES}", "budget=smoke", *overrides]) | changes
     (path / "videos").mkdir(parents=True)
@@ -54,11 +55,11 @@ def make(
     film = path / "videos" / f"frames_{total:012d}.mp4"
     film.write_bytes(b"film")
     Image.fromarray(np.full((48, 64, 3), 90, np.uint8)).save(film.with_suffix(".png"))
-    result = {"status": state, "frames": total, "metrics": metrics, "git": "0123abc"}
-    result |= {"pregrasp_used": config["pregrasp"]["source"], "versions": {"mujoco": "4.0.0"}}
-    result |= {"error": "the disk is full"} if state == "failed" else {}
+    content = {"status": state, "frames": total, "metrics": metrics, "git": "0123abc"}
+    content |= {"pregrasp_used": config["pregrasp"]["source"], "versions": {"mujoco": "4.0.0"}}
+    content |= {"error": "the disk is full"} if state == "failed" else {}
     if state != "running":
-        (path / "result.json").write_text(json.dumps(result | dict(told or {})))
+        (path / "result.json").write_text(json.dumps(content | dict(result or {})))
     return RunFolder(path)
 
 
@@ -70,9 +71,9 @@ def curve_run(
     state: str = "finished",
     **facts: Any,
 ) -> Run:
-    """Return a run as it is read, whose evaluations have these successes: frames to success.
+    """Return a run with evaluations of these successes: frames to success.
 
-    Its error is a hundredth of what the success lacks of 1; its task is one of tcdm30.
+    Its error is (1 - success) / 100; its task is one of tcdm30.
     """
     success = np.array(list(points.values()))
     values = {SUCCESS: success, ERROR: (1 - success) / 100}
@@ -113,6 +114,6 @@ def rows(name: str, out: Path | str = "out") -> list[dict[str, str]]:
 
 
 def text_of(page: str) -> str:
-    """Return what a page says, without its tags, in one line."""
+    """Return the text of a page without its tags, on one line."""
     body = re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)
     return " ".join(re.sub(r"<[^>]+>", " ", body).split())

@@ -64,25 +64,25 @@ def slurm(folder: Path) -> Iterator[None]:
     text = _CONF.format(host=host, user=user, folder=folder, ports=_free_ports(3), cores=CORES)
     (folder / "slurm.conf").write_text(text)
     try:
-        tell("slurmctld", "-c")
+        output("slurmctld", "-c")
         for node in NODES:
-            tell("slurmd", "-N", node)
+            output("slurmd", "-N", node)
         limit = time.monotonic() + 30
-        while tell("sinfo", "--noheader", "--format=%T", "--partition=main").split() != ["idle"]:
+        while output("sinfo", "--noheader", "--format=%T", "--partition=main").split() != ["idle"]:
             assert time.monotonic() < limit, (folder / "log" / "slurmctld.log").read_text()
             time.sleep(0.2)
         yield
     finally:
         subprocess.run(["scancel", "--quiet", "--me"], check=False)
         limit = time.monotonic() + 20
-        while tell("squeue", "--noheader") and time.monotonic() < limit:
+        while output("squeue", "--noheader") and time.monotonic() < limit:
             time.sleep(0.2)
         for file in folder.glob("*.pid"):  # a node that is down would not hear scontrol shutdown
             with contextlib.suppress(ProcessLookupError):
                 os.kill(int(file.read_text()), signal.SIGKILL)
 
 
-def tell(*command: str) -> str:
+def output(*command: str) -> str:
     """Run one of Slurm's commands, and return what it prints."""
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 

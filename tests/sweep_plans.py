@@ -1,4 +1,4 @@
-"""Small sweeps, as the planner would make them."""
+"""Small sweeps, as planned by the command line."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import IO
 
 from command_line import TINY
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.sweep.plan import Job, LocalCfg, Plan, SlurmCfg, SweepCfg, job_key
 
-SWEEP = SweepCfg(name=None, dir=None, max_attempts=2, detach=False, dry_run=False)
+SWEEP = SweepCfg(name=None, dir=None, max_attempts=2, detach=False, dry_run=False, most_jobs=10_000)
 LOCAL = LocalCfg(name="local", max_jobs=2, cores_per_job=1, memory_per_job_gb=1.0)
 SLURM = SlurmCfg(
     name="slurm",
@@ -46,7 +46,7 @@ def plan(folder: Path, jobs: int = 3, *overrides: str) -> Plan:
 
 
 def broken(whole: Plan, number: int) -> Plan:
-    """Return the plan with one job that fails whenever it is tried: its assets do not exist."""
+    """Return the plan with one job that always fails: its assets do not exist."""
     job = whole.jobs[number]
     task = dataclasses.replace(job.cfg.task, motion="no-such-motion")
     cfg = dataclasses.replace(job.cfg, task=task)
@@ -59,25 +59,25 @@ PROGRAM = """
 import sys
 from pathlib import Path
 from typing import IO
-from pgdm.cli.train import notify
+from pgdm.cli.sweep import FRONT
 from pgdm.sweep.launch import run_sweep
 from pgdm.sweep.plan import read_plan
 import sweep_plans
 plan = read_plan(Path(sys.argv[1]))
 launcher = getattr(sweep_plans, sys.argv[2])
-sys.exit(run_sweep(plan, sweep_plans.SWEEP, launcher, notify))
+sys.exit(run_sweep(plan, sweep_plans.SWEEP, launcher, FRONT))
 """
 
 
 def start(
     folder: Path, output: IO[str] | None = None, launcher: str = "LOCAL"
 ) -> subprocess.Popen[str]:
-    """Start a sweep that is planned, as a process of its own.
+    """Start a planned sweep as a process of its own.
 
     Args:
         folder: of the sweep.
-        output: where it prints to; None: into pipes.
-        launcher: which of the ones above.
+        output: file for its output; None: pipes.
+        launcher: name of one of those above.
     """
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     return subprocess.Popen(

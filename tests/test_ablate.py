@@ -1,4 +1,4 @@
-"""Ablated starts: what is asked for, what is free, and what is told where the two differ."""
+"""Ablated starts: what is wanted, what is free, and what is reported if the two differ."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ import pytest
 
 import pgdm
 from command_line import command
+from pgdm.config.compose import compose
 from pgdm.config.groups import available
-from pgdm.config.store import compose
 from pgdm.config.suites import suite
 from pgdm.envs.build import EnvBuilder
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
-from pgdm.pregrasp.ablate import OVERLAP_M, AblationCfg, ablate
-from pgdm.pregrasp.ablated import Ablated
+from pgdm.pregrasp.ablation.ablate import OVERLAP_M, Ablated, AblationCfg, ablate
+from pgdm.pregrasp.hand_geometry import posed
 from pgdm.pregrasp.sources import StartState, start_state
 from pgdm.sim.contact import HandContact
 
 ALL = ("open_hand", "mean_hand", "distance_15cm", "distance_25cm")
-# A plan beside a tool, a stem between fingers, a start inside its object, and the other hands.
+# A plan next to a tool, a stem between fingers, a start inside its object, and other hands.
 TASKS = ("hammer-use1", "wineglass-drink2", "fryingpan-cook2", "dhand-cup", "dmanus-crackerbox")
 
 RETREAT_M = {"dhand-stanfordbunny-inspect": 0.13}
-"""Its fingers lie around the bunny: to be straight, they have to leave it."""
+"""Its fingers enclose the bunny: to be straight, they have to move off it."""
 
 
 @cache
@@ -45,7 +45,7 @@ def made(task: str, pregrasp: str, ablation: str) -> tuple[StartState, Ablated]:
 
 
 def check(task: str, pregrasp: str, ablation: str) -> Ablated:
-    """Check all that holds for every ablated start."""
+    """Check what holds for every ablated start."""
     stored, found = made(task, pregrasp, ablation)
     scene = builder(task).scene
     nu, base = scene.model.nu, scene.hand.num_base_joints
@@ -53,8 +53,8 @@ def check(task: str, pregrasp: str, ablation: str) -> Ablated:
     np.testing.assert_array_equal(qpos[nu:], stored.qpos[nu:])  # the object stays
     np.testing.assert_array_equal(found.start.qvel[nu:], stored.qvel[nu:])
     assert not found.start.qvel[:nu].any()
-    np.testing.assert_array_equal(qpos[3:first], stored.qpos[3:first])  # so does the orientation
-    # Mined slides may lie beyond their range, but none goes out further.
+    np.testing.assert_array_equal(qpos[3:first], stored.qpos[3:first])  # and so does the rotation
+    # Mined slides may exceed their range, but none exceeds it further.
     low, high = scene.model.jnt_range[:3].T
     low, high = np.minimum(low, stored.qpos[:3]), np.maximum(high, stored.qpos[:3])
     assert ((qpos[:3] > low - 1e-9) & (qpos[:3] < high + 1e-9)).all()
@@ -98,15 +98,14 @@ def test_ablated_starts_of_all_tasks() -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_hammers_hand_moves_in_the_world_by_what_is_asked_for() -> None:
+def test_the_hammer_task_hand_moves_by_the_distance_in_the_world() -> None:
     scene = builder("hammer-use1").scene
-    data = mujoco.MjData(scene.model)
-    points = []
-    for ablation in ("none", "distance_15cm", "distance_25cm"):
-        data.qpos[:] = made("hammer-use1", "planned", ablation)[1].start.qpos
-        mujoco.mj_kinematics(scene.model, data)
-        points.append(data.geom_xpos[scene.index.point_geoms].copy())
-    near, middle, far = points
+    near, middle, far = (
+        posed(scene, made("hammer-use1", "planned", ablation)[1].start.qpos).geom_xpos[
+            scene.index.point_geoms
+        ]
+        for ablation in ("none", "distance_15cm", "distance_25cm")
+    )
     np.testing.assert_allclose(np.linalg.norm(middle - near, axis=1), 0.15)
     np.testing.assert_allclose(np.linalg.norm(far - near, axis=1), 0.25)
     np.testing.assert_allclose((far - near) * 0.6, middle - near, atol=1e-12)  # one line
@@ -124,7 +123,7 @@ def test_a_reset_pose_that_is_nearer_is_passed() -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_slide_ends_the_line() -> None:
+def test_the_line_ends_at_the_limit_of_a_slide() -> None:
     _, found = made("hammer-strike", "planned", "distance_25cm")
     assert found.distance_m == pytest.approx(0.1863, abs=1e-4)
     low, high = builder("hammer-strike").scene.model.jnt_range[:3].T
@@ -148,22 +147,25 @@ def test_without_an_ablation_the_start_is_the_stored_one() -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_what_is_not_as_asked_for_is_told_in_words() -> None:
+def test_deviations_are_reported_in_words() -> None:
     stored, _ = made("duck-lift", "planned", "none")
     exact = Ablated(stored, 0.15, 0.0, 0.0, 0.0, False, 0.0)
     assert exact.compromises(0.15) == ""
-    assert exact.compromises(0.25) == "a slide ends 15.0 cm away, not 25.0"
+    assert exact.compromises(0.25) == "a slide reaches its limit at 15.0 cm instead of 25.0"
     off = replace(exact, retreat_m=0.012, finger_error_rad=0.48)
     assert off.compromises(0.15) == (
-        "the wrist retreats 1.2 cm to touch nothing, fingers stop 0.48 rad short of their pose"
+        "the hand retreats 1.2 cm to touch nothing, fingers stop 0.48 rad short of their pose"
     )
     cfg = compose(["task=hammer-strike", "ablation=distance_25cm"])
     (note,) = env_builder(cfg, open_library()).notes
-    assert note == ("ablation=distance_25cm of hammer-strike: a slide ends 18.6 cm away, not 25.0")
+    assert note == (
+        "ablation=distance_25cm of hammer-strike: a slide reaches its limit at 18.6 cm instead of "
+        "25.0"
+    )
 
 
 @pytest.mark.usefixtures("library_home")
-def test_envs_start_ablated_and_runs_tell() -> None:
+def test_envs_start_ablated_and_runs_record_it() -> None:
     env = pgdm.make_batch("dhand-cup", num_envs=2, num_threads=1, ablation="mean_hand")
     _, found = made("dhand-cup", "planned", "mean_hand")
     np.testing.assert_array_equal(env.sim.read().qpos[1].numpy(), found.start.qpos)
@@ -177,7 +179,7 @@ def test_envs_start_ablated_and_runs_tell() -> None:
 
 @pytest.mark.usefixtures("library_home")
 def test_a_residual_actions_path_starts_at_the_ablated_start() -> None:
-    """Else the path would give back the nearness that was taken away."""
+    """Else the path would restore the proximity that the ablation removes."""
     overrides = ["action=residual", "ablation=distance_15cm", "action.lead_steps=0"]
     env = pgdm.make_batch("hammer-use1", num_envs=1, num_threads=1, overrides=overrides)
     still = env.mdp.actions.act(env.warm_start()[None], env.t)
@@ -192,7 +194,7 @@ def test_mean_fingers_are_those_of_the_mined_pre_grasps() -> None:
         name: mujoco.MjModel.from_xml_path(str(library.hand_xml(name, "checkout")))
         for name in hands
     }
-    # Of these 50: dmanus-sim2real has dmanus-crackerbox's pre-grasp.
+    # Of tcdm50 only: dmanus-sim2real has the pre-grasp of dmanus-crackerbox.
     for task in suite("tcdm50"):
         prefix = task.split("-")[0]
         hand = hands[prefix if prefix in hands else "adroit"]
@@ -247,7 +249,7 @@ def test_a_hand_without_its_mean_is_named() -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_contact_sheet_shows_all(tmp_path: Path) -> None:
+def test_a_contact_sheet_shows_all_ablations(tmp_path: Path) -> None:
     line = ["view", "duck-lift", "--ablations", "--offline"]
     outcome = command("pgdm", *line, "--image", "out/sheet.png")
     if "no OpenGL" in outcome.err:

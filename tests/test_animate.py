@@ -1,4 +1,4 @@
-"""Keyframes become a smooth motion: numbers worked by hand, and laws."""
+"""Keyframes become a smooth motion: values computed by hand, and properties."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pgdm.errors import ConfigError
-from pgdm.library import animate
-from pgdm.library.animate import Keyframe, continuous, parse, sample
+from pgdm.library.files import keyframes as animate
+from pgdm.library.files.keyframes import Keyframe, continuous, parse, sample
 
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -147,7 +147,7 @@ def test_a_file_gives_a_trajectory_at_25_hz_relative_to_the_rest(tmp_path: Path)
         ("keyframes: [{time_s: 0}, {time_s: .inf}]", "is at inf s; 3600 s at most"),
         ("keyframes: [{time_s: 0}, {time_s: 1.0e+14}]", r"is at 1e\+14 s; 3600 s at most"),
         ("keyframes: [{time_s: 0}, {time_s: 1, stop: 2}]", "stop is 2; valid: true, false"),
-        ("frame: world\nplace: {pos_m: [0, 0]}\nkeyframes: []", "'place' is of frame 'rest'"),
+        ("frame: world\nplace: {pos_m: [0, 0]}\nkeyframes: []", "'place' needs frame 'rest'"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_in_a_file_is_named(text: str, message: str) -> None:

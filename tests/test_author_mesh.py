@@ -1,4 +1,4 @@
-"""Meshes that somebody brings: wrong units, holes, openings, what is repaired and what refused."""
+"""Meshes from users: wrong units, holes, openings; which are repaired and which refused."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ import trimesh
 
 from brought_meshes import VOLUME, box, saved
 from pgdm.errors import ConfigError, CorruptAssetError
-from pgdm.library import author_mesh
+from pgdm.library.authored import mesh as author_mesh
 
 
 @pytest.mark.parametrize(
-    ("factor", "scale", "said"),
+    ("factor", "scale", "message"),
     [
         (1000.0, 1.0, "longest side is 80 m; it looks like mm .8 cm.: use --unit mm"),
         (100.0, 1.0, "longest side is 8 m; it looks like cm .8 cm.: use --unit cm"),
         (1.0, 0.001, "longest side is 0.08 mm; it looks like m .8 cm.: use --unit m"),
-        (1e6, 1.0, "no unit makes that a thing of 2 cm to 60 cm: give --scale"),
+        (1e6, 1.0, "no unit puts that between 2 cm and 60 cm: give --scale"),
     ],
 )
-def test_a_wrong_unit_is_guessed(factor: float, scale: float, said: str) -> None:
+def test_a_wrong_unit_is_guessed(factor: float, scale: float, message: str) -> None:
     path = saved(box().apply_scale(factor))
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         author_mesh.read(path, scale)
 
 
-def test_a_hole_is_filled_and_said() -> None:
+def test_a_hole_is_filled_and_noted() -> None:
     mesh = box()
     mesh.update_faces(mesh.face_normals[:, 2] < 0.5)  # the lid is gone
     found = author_mesh.read(saved(mesh))
@@ -74,7 +74,7 @@ def test_an_open_surface_is_refused_unless_its_mass_is_known() -> None:
         author_mesh.read(path)
     found = author_mesh.read(path, allow_open=True)
     assert not found.closed and found.volume_m3 == found.hull_m3
-    assert any("stays open: the convex hull's" in repair for repair in found.repairs)
+    assert any("volume is taken as the convex hull" in repair for repair in found.repairs)
 
 
 def test_faces_wound_inward_or_mixed_are_turned() -> None:
@@ -94,7 +94,7 @@ def test_faces_without_area_and_twice_are_removed() -> None:
     found = author_mesh.read(saved(trimesh.Trimesh(mesh.vertices, extra, process=False), "it.ply"))
     assert len(found.faces) == 12 and found.closed
     assert any("2 faces without area" in repair for repair in found.repairs)
-    assert any("2 faces that are there twice" in repair for repair in found.repairs)
+    assert any("2 duplicate faces" in repair for repair in found.repairs)
 
 
 def test_pieces_are_counted() -> None:
@@ -104,7 +104,7 @@ def test_pieces_are_counted() -> None:
     assert any("2 separate pieces are one rigid object" in repair for repair in found.repairs)
 
 
-def test_what_cannot_be_a_body_is_refused() -> None:
+def test_meshes_without_a_body_are_refused() -> None:
     flat = trimesh.Trimesh(
         [[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]], [[0, 1, 2], [0, 2, 3]]
     )
@@ -112,35 +112,35 @@ def test_what_cannot_be_a_body_is_refused() -> None:
     line = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]], [[0, 1, 2]], process=False)
     nan = box()
     nan.vertices[3] = np.nan
-    for mesh, said in (
+    for mesh, message in (
         (flat, "is flat"),
         (point, "all its vertices are one point"),
         (line, "none of its 1 faces has an area"),
         (nan, r"1 of 8 vertices are NaN or infinite, the first is number 3"),
     ):
-        with pytest.raises(CorruptAssetError, match=said):
+        with pytest.raises(CorruptAssetError, match=message):
             author_mesh.read(saved(mesh, "it.ply"))
 
 
-def test_a_file_that_is_none_is_named() -> None:
-    for name, content, said in (
+def test_files_that_are_no_meshes_are_named() -> None:
+    for name, content, message in (
         ("empty.stl", b"", r"empty\.stl: "),
         ("noise.glb", b"\x01\x02" * 40, "not a readable mesh"),
-        ("words.obj", b"hello", "holds no faces|not a readable mesh"),
+        ("words.obj", b"hello", "has no faces|not a readable mesh"),
         ("cut.stl", saved(box()).read_bytes()[:200], r"cut\.stl: "),
     ):
         Path(name).write_bytes(content)
-        with pytest.raises(CorruptAssetError, match=said) as caught:
+        with pytest.raises(CorruptAssetError, match=message) as caught:
             author_mesh.read(Path(name))
         assert "\n" not in str(caught.value)
-    with pytest.raises(ConfigError, match=r"format '\.step' is not read; valid: \.stl"):
+    with pytest.raises(ConfigError, match=r"format '\.step' is not supported; valid: \.stl"):
         author_mesh.read(Path("it.step"))
     with pytest.raises(ConfigError, match="there is no such file"):
         author_mesh.read(Path("none.stl"))
 
 
 @pytest.mark.slow
-def test_two_million_faces_are_simplified_and_said() -> None:
+def test_two_million_faces_are_simplified_and_noted() -> None:
     ring = trimesh.creation.torus(0.05, 0.02, major_sections=2000, minor_sections=500)
     assert len(ring.faces) == 2_000_000
     found = author_mesh.read(saved(ring))

@@ -1,4 +1,4 @@
-"""Objects from meshes: hand-worked figures of good ones, and what is said about bad ones."""
+"""Objects from meshes: hand-worked values of good ones, errors of bad ones."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from brought_meshes import MASS, SIDES, VOLUME, box, saved
 from command_line import command
 from pgdm import paths
 from pgdm.errors import ConfigError, LibraryError, PgdmError, UnknownNameError
-from pgdm.library import author_mesh, open_library, own
-from pgdm.library.author_object import ObjectRequest, author_object
-from pgdm.library.author_parts import PartsCfg, convex_parts
-from pgdm.library.verify import damaged
+from pgdm.library import open_library
+from pgdm.library.authored import mesh as author_mesh
+from pgdm.library.authored import own
+from pgdm.library.authored.object import ObjectRequest, author_object
+from pgdm.library.authored.parts import PartsCfg, convex_parts
+from pgdm.library.checks.verify import damaged
 
 
 def compiled(name: str) -> mujoco.MjModel:
@@ -69,18 +71,18 @@ def test_a_known_mass_counts_and_the_density_otherwise() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
-        ("hammer", "is the library's own"),
-        ("door", "is the library's own"),
-        ("dhand", "is the library's own"),
-        ("My-Thing", "is not valid: a small letter"),
+        ("hammer", "is taken by the library"),
+        ("door", "is taken by the library"),
+        ("dhand", "is taken by the library"),
+        ("My-Thing", "is not valid: a lower-case letter"),
         ("", "is not valid"),
         ("../x", "is not valid"),
     ],
 )
-def test_names_are_checked(name: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_names_are_checked(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         author_object(ObjectRequest(saved(box()), name))
 
 
@@ -88,18 +90,18 @@ def test_an_object_is_replaced_only_on_request_and_removed() -> None:
     path = saved(box())
     first = author_object(ObjectRequest(path, "brick"))
     before = (first.folder / "object.xml").read_bytes()
-    with pytest.raises(ConfigError, match="you have an object 'brick' already; --replace"):
+    with pytest.raises(ConfigError, match="you already have an object 'brick'; --replace"):
         author_object(ObjectRequest(path, "brick"))
     author_object(ObjectRequest(path, "brick", replace=True))
     assert (first.folder / "object.xml").read_bytes() == before  # equal input, equal output
     own.remove("brick")
     assert not first.folder.exists() and own.read().files == {}
-    with pytest.raises(UnknownNameError, match="unknown object or task of your own 'brick'"):
+    with pytest.raises(UnknownNameError, match="unknown object, hand or task of your own 'brick'"):
         own.remove("brick")
 
 
 def test_an_object_that_fails_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pgdm.library import author_object as module
+    from pgdm.library.authored import object as module
 
     def broken(path: Path) -> None:
         raise LibraryError("the simulation of its fall diverges")
@@ -120,7 +122,7 @@ def test_what_stands_on_its_tip_falls_over_and_a_ball_stays() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"density": 0.0}, "--density is 0; valid: 10 to 20000"),
         ({"mass_kg": -1.0}, "--mass is -1; valid"),
@@ -130,19 +132,19 @@ def test_what_stands_on_its_tip_falls_over_and_a_ball_stays() -> None:
         ({"parts": PartsCfg(0.05, 0)}, "--parts is 0; valid: 1 to 64"),
     ],
 )
-def test_options_are_checked(options: dict, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_options_are_checked(options: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         author_object(ObjectRequest(saved(box()), "brick", **options))
 
 
-def test_the_command_says_and_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.stdin", io.StringIO())  # nobody answers
+def test_the_command_prints_and_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())  # no answer
     saved(box().apply_scale(1000))
     wrong = command("pgdm", "author", "object", "it.stl", "--name", "brick")
     assert wrong.code == 2 and "use --unit mm" in wrong.err
     made = command("pgdm", "author", "object", "it.stl", "--name", "brick", "--unit", "mm")
     assert made.code == 0, made.err
-    assert "240.0 g" in made.out and "rests as it was put" in made.out
+    assert "240.0 g" in made.out and "rests as placed" in made.out
     if "no picture" not in made.err:
         assert (paths.user() / "library/objects/brick/picture.png").stat().st_size > 2000
     listed = command("pgdm", "author", "list").out
@@ -150,10 +152,10 @@ def test_the_command_says_and_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     both = command(
         "pgdm", "author", "object", "it.stl", "--name", "b", "--unit", "mm", "--scale", "1"
     )
-    assert both.code == 2 and "say the same" in both.err
+    assert both.code == 2 and "exclude each other" in both.err
     assert "nothing was removed" in command("pgdm", "author", "remove", "brick").out
     assert command("pgdm", "author", "remove", "brick", "--yes").code == 0
-    assert "no objects or tasks yet" in command("pgdm", "author", "list").out
+    assert "no objects, hands or tasks yet" in command("pgdm", "author", "list").out
 
 
 def elbow() -> trimesh.Trimesh:
@@ -173,18 +175,18 @@ def test_an_elbow_is_two_parts_equal_each_time(
 ) -> None:
     mesh = author_mesh.read(saved(elbow()))
     assert mesh.volume_m3 == pytest.approx(40e-6)
-    told: list[str] = []
+    steps: list[str] = []
     found = []
     for home in ("one", "two"):
         monkeypatch.setenv("PGDM_HOME", str(tmp_path / home))
-        found.append(convex_parts(mesh, PartsCfg(), lambda step, done, total: told.append(step)))
-    assert told and len(found[0]) == 2
+        found.append(convex_parts(mesh, PartsCfg(), lambda step, done, total: steps.append(step)))
+    assert steps and len(found[0]) == 2
     assert sum(part.trimesh().volume for part in found[0]) == pytest.approx(40e-6, rel=0.05)
     for one, two in zip(*found, strict=True):
         assert np.array_equal(one.vertices, two.vertices)
-    told.clear()
-    cached = convex_parts(mesh, PartsCfg(), lambda step, done, total: told.append(step))
-    assert not told and np.array_equal(cached[0].vertices, found[0][0].vertices)
+    steps.clear()
+    cached = convex_parts(mesh, PartsCfg(), lambda step, done, total: steps.append(step))
+    assert not steps and np.array_equal(cached[0].vertices, found[0][0].vertices)
 
 
 def test_a_damaged_record_is_named() -> None:
@@ -193,3 +195,18 @@ def test_a_damaged_record_is_named() -> None:
     (made.folder / "object.json").write_text("{")
     with pytest.raises(PgdmError, match=r"object\.json: unreadable"):
         own.facts("brick")
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [(RuntimeError("no hull"), LibraryError), (ZeroDivisionError("1/0"), ZeroDivisionError)],
+)
+def test_only_errors_of_coacd_are_blamed_on_the_mesh(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, expected: type[Exception]
+) -> None:
+    def failing(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("pgdm.library.authored.parts._decomposed", failing)
+    with pytest.raises(expected, match=str(error)):
+        convex_parts(author_mesh.read(saved(elbow())), PartsCfg())

@@ -1,4 +1,4 @@
-"""Tasks of one's own: what a motion must be, the three ways to bring one, and the shipped seven."""
+"""The user's own tasks: checks of motions, their sources, and the seven tasks that pgdm ships."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ from pgdm.author import TaskRequest, author_task
 from pgdm.author.motion import MotionRequest
 from pgdm.author.task import remove_task, task_path
 from pgdm.cem import CemCfg
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.config.suites import suite
 from pgdm.errors import ConfigError, CorruptAssetError, LibraryError, PgdmError, UnknownNameError
 from pgdm.experiment import env_builder
-from pgdm.library import animated, ensure, motion_file, open_library, own, pregrasp_file
-from pgdm.library.author_object import ObjectRequest, author_object
-from pgdm.library.motion_checks import Poses, TableCheck, check_motion
-from pgdm.library.pregrasp_file import Pregrasp
-from pgdm.library.verify import damaged
+from pgdm.library import animated, ensure, open_library
+from pgdm.library.authored import own
+from pgdm.library.authored.object import ObjectRequest, author_object
+from pgdm.library.checks.motion import Poses, TableCheck, check_motion
+from pgdm.library.checks.verify import damaged
+from pgdm.library.files import motion as motion_file
+from pgdm.library.files import pregrasp as pregrasp_file
+from pgdm.library.files.pregrasp import Pregrasp
 from pgdm.pregrasp import near
-from pgdm.pregrasp.reach import REACH, plan_reach
+from pgdm.pregrasp.reach.planner import REACH, plan_reach
 from pgdm.sim.contact import HandContact
 from recorded_poses import line
 
@@ -40,7 +43,7 @@ LIFT = """keyframes:
 
 @pytest.fixture
 def brick(library_home: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return the name of a box of one's own, 5 x 6 x 12 cm; hands are searched in a hurry."""
+    """Return the name of an own box, 5 x 6 x 12 cm; the searches are cut short."""
     del library_home
     for name, count in {"STARTS": 2, "ROUNDS": 12}.items():
         monkeypatch.setattr(near, name, count)
@@ -76,9 +79,9 @@ def test_keyframes_become_a_task_that_runs(brick: str) -> None:
     assert "own" in command("pgdm", "assets", "list").out
     shown = command("pgdm", "assets", "show", "brick-lift")
     assert shown.code == 0 and "source own (serves the task)" in shown.out, shown.err
-    with pytest.raises(LibraryError, match="object 'brick' plays in brick-lift; remove it first"):
+    with pytest.raises(LibraryError, match="object 'brick' is used by brick-lift; remove it first"):
         own.remove("brick")
-    # A pre-grasp of the user's is for one motion: for another one it is set aside.
+    # The user's pre-grasps are for one motion: with another they are set aside.
     kept = pregrasp_file.path_of("brick-lift", "dmanus", "labeled")
     pregrasp_file.write(kept, Pregrasp(motion.starts["mined"], None, {}))
     anew = request(MotionRequest(Path("lift.yaml"), None), pregrasp="later", replace=True)
@@ -100,27 +103,28 @@ def recorded(brick: str) -> Path:
     return Path("rec.npz")
 
 
-def test_a_recording_is_bent_to_begin_where_the_object_rests(recorded: Path) -> None:
+def test_a_recording_is_blended_to_start_where_the_object_rests(recorded: Path) -> None:
     made = author_task(request(MotionRequest(None, recorded), pregrasp="later"), open_library())
     assert made.motion.poses.pos[0, 2] == pytest.approx(0.06, abs=1e-3)
     assert made.motion.poses.pos[-1, 2] == pytest.approx(0.063 + line(0.3, 40)[-1, 0])
-    assert made.motion.notes[0].startswith("its first 0.6 s were bent to begin where")
+    assert made.motion.notes[0].startswith("the columns have no names and were read as x y z qw")
+    assert made.motion.notes[1].startswith("its first 0.6 s were blended to start where")
     assert (made.pregrasp.qpos[:16] == 0).all()
 
 
-def test_a_recording_that_begins_in_the_air_needs_settling(recorded: Path) -> None:
+def test_a_recording_that_starts_in_the_air_needs_settling(recorded: Path) -> None:
     rows = np.load(recorded)["poses"]
     rows[:, 2] += 0.1
     np.savez("high.npz", poses=rows)
     high = MotionRequest(None, Path("high.npz"))
-    with pytest.raises(ConfigError, match=r"does not rest where the motion begins: .*--settle"):
+    with pytest.raises(ConfigError, match=r"does not rest where the motion starts: .*--settle"):
         author_task(request(high, pregrasp="later"), open_library())
     settled = MotionRequest(None, Path("high.npz"), settle=True)
     made = author_task(request(settled, pregrasp="later"), open_library())
     assert made.motion.poses.pos[0, 2] == pytest.approx(0.06, abs=1e-3)
 
 
-def test_the_meshs_own_origin_may_be_meant(library_home: Path) -> None:
+def test_positions_may_be_of_the_meshs_origin(library_home: Path) -> None:
     box = trimesh.creation.box((0.05, 0.06, 0.12)).apply_translation([0, 0, 0.06])
     box.export("brick.stl")  # its origin is under its floor
     author_object(ObjectRequest(Path("brick.stl"), "brick"))
@@ -132,7 +136,7 @@ def test_the_meshs_own_origin_may_be_meant(library_home: Path) -> None:
     assert made.motion.poses.pos[0, 2] == pytest.approx(0.06, abs=1e-3)
 
 
-def test_what_is_underground_is_refused_or_raised(recorded: Path) -> None:
+def test_poses_in_the_table_are_refused_or_raised(recorded: Path) -> None:
     rows = np.load(recorded)["poses"]
     rows[:, 2] -= np.interp(np.arange(40), [0, 20, 30, 39], [0.0, 0.0, 0.35, 0.35])
     np.savez("deep.npz", poses=rows)
@@ -146,26 +150,26 @@ def test_what_is_underground_is_refused_or_raised(recorded: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "said"),
+    ("changes", "error", "message"),
     [
-        ({"id": "hammer-use1"}, ConfigError, "'hammer-use1' is one of pgdm's own"),
-        ({"id": "tcdm50"}, ConfigError, "'tcdm50' is one of pgdm's own"),
+        ({"id": "hammer-use1"}, ConfigError, "'hammer-use1' is taken by pgdm"),
+        ({"id": "tcdm50"}, ConfigError, "'tcdm50' is taken by pgdm"),
         ({"id": "Big Lift"}, ConfigError, "task id 'Big Lift' is not valid"),
-        ({"object": "brik"}, UnknownNameError, "one's own 'brik'; did you mean brick"),
+        ({"object": "brik"}, UnknownNameError, "your own 'brik'; did you mean brick"),
         ({"hand": "dhnd"}, UnknownNameError, "unknown hand 'dhnd'; did you mean dhand"),
         ({"id": "brick"}, ConfigError, "you have an object 'brick'; choose another id"),
-        ({"object": "door"}, UnknownNameError, "unknown object for a task of one's own 'door'"),
+        ({"object": "door"}, UnknownNameError, "unknown object for a task of your own 'door'"),
         ({"pregrasp": "x.npz"}, ConfigError, "--pregrasp x.npz: there is no such file"),
         ({"pregrasp": "none"}, ConfigError, "neither mean, open, later, a .npz file, nor a task"),
         (
             {"pregrasp": "cup-pour1"},
             ConfigError,
-            "is of hand 'adroit', this task's hand is 'dmanus'",
+            "is for hand 'adroit', this task's hand is 'dmanus'",
         ),
     ],
 )
-def test_names_are_checked(brick: str, changes: dict, error: type, said: str) -> None:
-    with pytest.raises(error, match=said):
+def test_names_are_checked(brick: str, changes: dict, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
         author_task(request(MotionRequest(Path("lift.yaml"), None), **changes), open_library())
     assert own.read().tasks == {} and not task_path("brick-lift").exists()
 
@@ -179,10 +183,10 @@ def test_a_task_needs_one_motion_within_reach(brick: str) -> None:
         LIFT.replace("[0, 0, 0.1]", "[0.9, 0, 0.1]").replace("0.9,", "2,", 1)
     )
     far = request(MotionRequest(Path("far.yaml"), None))
-    with pytest.raises(PgdmError, match="the wrist cannot follow the motion"):
+    with pytest.raises(PgdmError, match="the hand cannot follow the motion"):
         author_task(far, open_library())
     Path("away.yaml").write_text("place: {pos_m: [0.6, 0]}\n" + LIFT)
-    with pytest.raises(ConfigError, match=r"beside the table|does not come to rest"):
+    with pytest.raises(ConfigError, match=r"off the table|does not come to rest"):
         author_task(request(MotionRequest(Path("away.yaml"), None)), open_library())
 
 
@@ -243,7 +247,7 @@ def test_an_animated_task_starts_free_and_steps(fresh_home: Path, task: str) -> 
     assert depths.max() < 1e-3
     env = builder.make(num_envs=2, num_threads=1)
     hold = normalize(builder.scene.index, torch.from_numpy(start.qpos.copy())).float()
-    hold[: builder.scene.index.num_base_joints] = 0.0  # residual: the wrist stays by itself
+    hold[: builder.scene.index.num_base_joints] = 0.0  # zero residual
     for _ in range(8):
         obs, reward, *_ = env.step(hold.expand(2, -1))
     # At rest the object stays under its target until the motion begins.
@@ -255,5 +259,5 @@ def test_a_motion_file_keeps_its_form(brick: str) -> None:
     path = open_library().motion_path("brick-lift")
     assert motion_file.read(path, "brick-lift", "own").substeps == 10
     path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(CorruptAssetError, match="not a readable"):
+    with pytest.raises(CorruptAssetError, match="was changed"):
         open_library().motion("brick-lift")

@@ -1,4 +1,4 @@
-"""When stored results of trainings are kept, trained anew, or left out of means."""
+"""When stored results of runs are kept, trained anew, or left out of means."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from pgdm.config.compose import compose
 from pgdm.config.saved import save_config
-from pgdm.config.store import compose
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmark"))
 import experiments

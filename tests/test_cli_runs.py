@@ -9,10 +9,11 @@ import yaml
 from filelock import FileLock
 from typer.testing import CliRunner
 
+from command_line import in_terminal
 from fake_runs import LENGTH, STEP, empty_database, end, make, train
 from pgdm.cli.runs import app, row
-from pgdm.errors import RunError
-from pgdm.tracking import RunFolder
+from pgdm.errors import ConfigError, RunError, UnknownNameError
+from pgdm.runs.folder import RunFolder
 
 __all__ = ["empty_database"]  # a fixture
 
@@ -44,7 +45,7 @@ def test_table_of_a_finished_run(tmp_path: Path) -> None:
     ]
 
 
-def test_ablated_starts_are_told_apart(tmp_path: Path) -> None:
+def test_ablated_starts_are_marked(tmp_path: Path) -> None:
     folder = make(tmp_path / "runs" / "a")
     config = {**folder.config, "ablation": {"name": "open_hand"}}
     (folder.path / "config.yaml").write_text(yaml.safe_dump(config))
@@ -118,8 +119,81 @@ def test_no_runs(tmp_path: Path) -> None:
     assert pgdm_runs("--json") == "[]\n"
 
 
+LONG = "dhand-stanfordbunny-inspect/curriculum/planned-residual-ppo_fast-s1-1a2b3c41"
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120])
+def test_a_narrow_terminal_shows_every_run_legibly_and_its_name_whole(
+    tmp_path: Path, columns: int
+) -> None:
+    for seed, name in enumerate((f"{RUN}-1a2b3c40", LONG)):
+        finished(tmp_path / "runs" / name, seed)
+    head, first, *rest = (line.rstrip() for line in in_terminal(columns, "runs"))
+    assert {"task", "frames", "success", "status"} <= set(head.split())
+    assert len(head) <= columns and len(first) <= columns
+    assert first.split()[0] == "hammer-use1" and "10.0%" in first and "finished" in first
+    assert rest[0] == f"  {RUN}-1a2b3c40"
+    assert rest[2] == f"  {LONG}"
+
+
+def test_nothing_is_cut_in_a_pipe(tmp_path: Path) -> None:
+    name = "/".join(["a" * 100] * 5)
+    finished(tmp_path / "runs" / name)
+    assert pgdm_runs().splitlines()[1].split()[-1] == name
+
+
+def test_runs_are_filtered_sorted_and_limited(tmp_path: Path) -> None:
+    for seed in (2, 0, 1):
+        finished(tmp_path / "runs" / f"s{seed}", seed)
+    make(tmp_path / "runs" / "cup", 5, task={"id": "cup-pour1"})
+    (make(tmp_path / "runs" / "broken").path / "config.yaml").write_text("[")
+
+    def names(*options: str) -> list[str]:
+        return [found["run"] for found in json.loads(pgdm_runs("--json", *options))]
+
+    assert names("--where", "task=hammer*", "--sort", "seed") == ["s0", "s1", "s2"]
+    assert names("--where", "task=hammer*", "--sort", "-seed", "-n", "2") == ["s2", "s1"]
+    assert names("--where", "task=hammer*", "--sort", "seed", "-n", "2") == ["s1", "s2"]
+    assert names("--where", "status=finished", "--where", "seed=1") == ["s1"]
+    assert names("--where", "status=unreadable") == ["broken"]
+    assert names("--sort", "error")[-1] in {"s0", "s1", "s2"}  # those without a value come first
+    assert "none of the 5 runs" in pgdm_runs("--where", "seed=7")
+    with pytest.raises(UnknownNameError, match="unknown column 'sucess'; did you mean success"):
+        pgdm_runs("--sort", "sucess")
+    with pytest.raises(ConfigError, match="cannot read 'seed'; write COLUMN=VALUE"):
+        pgdm_runs("--where", "seed")
+
+
+def test_runs_are_removed_after_a_question(tmp_path: Path) -> None:
+    finished(tmp_path / "runs" / "a")
+    finished(tmp_path / "runs" / "b")
+    assert "nothing was removed" in pgdm_runs("remove", "a")  # nobody answers
+    assert (tmp_path / "runs" / "a").is_dir()
+    assert f"removed {tmp_path / 'runs' / 'a'}" in pgdm_runs("remove", "a", "--yes")
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["b"]
+
+
+def test_what_is_no_run_or_in_use_is_not_removed(tmp_path: Path) -> None:
+    finished(tmp_path / "runs" / "a")
+    (tmp_path / "link").symlink_to(tmp_path / "runs" / "a")
+    (tmp_path / "other").mkdir()
+    checkpoint = next((tmp_path / "runs" / "a" / "checkpoints").glob("*.ckpt"))
+    with pytest.raises(RunError, match="is a link"):
+        pgdm_runs("remove", "link", "--yes")
+    with pytest.raises(RunError, match="holds no run"):
+        pgdm_runs("remove", "other", "--yes")
+    with pytest.raises(RunError, match="name the run's own folder"):
+        pgdm_runs("remove", str(checkpoint), "--yes")
+    with (
+        FileLock(tmp_path / "runs" / "a" / ".lock"),
+        pytest.raises(RunError, match="is running; stop it first"),
+    ):
+        pgdm_runs("remove", "a", "--yes")
+    assert checkpoint.is_file()
+
+
 @pytest.mark.filterwarnings("ignore")
-def test_sync_says_what_it_did(tmp_path: Path, empty_database: Path) -> None:
+def test_sync_prints_what_it_did(tmp_path: Path, empty_database: Path) -> None:
     finished(tmp_path / "runs" / RUN)
     (make(tmp_path / "runs" / "x").path / "config.yaml").write_text("[")
     shutil.copy(empty_database, tmp_path / "runs" / "mlflow.db")

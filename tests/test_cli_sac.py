@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from command_line import TINY, TINY_SAC, Outcome, command
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.errors import CheckpointError
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
-from pgdm.tracking.run_folder import read_json
+from pgdm.runs.files import read_json
 
 FILES = {"observation", "action", "terms", "discount", "terminated", "next_observation"}
 
@@ -33,15 +33,15 @@ def test_a_dry_run_says_how_large_the_replay_is(library_home: Path, tmp_path: Pa
     probe = env_builder(compose(["algo=sac"]), open_library()).make(1, 1)
     terms = len(probe.reward_weights())
     frame = 2 * (2 * probe.obs_dim + probe.action_dim) + 4 * terms + 1
-    said = " ".join((outcome.out + outcome.err).split())
-    assert f"the replay takes {1_000_016 * frame / 1e9:.2f} GB of disk" in said
-    assert "removed when the run has finished" in said
-    assert "+experiment=fast" not in said
+    text = " ".join((outcome.out + outcome.err).split())
+    assert f"the replay takes {1_000_016 * frame / 1e9:.2f} GB of disk" in text
+    assert "removed when the run has finished" in text
+    assert "+experiment=fast" not in text
     papers = sac_run("total_frames=50_000_000", "budget=paper", "--dry-run")
     length = compose(["+experiment=fast"]).total_frames
     assert f"+experiment=fast trains for {length:,} frames" in " ".join(papers.out.split())
     kept = sac_run("total_frames=1000001", "keep_replay=true", "--dry-run")
-    assert "it is kept" in " ".join((kept.out + kept.err).split())
+    assert "and is kept" in " ".join((kept.out + kept.err).split())
     ppo = command("pgdm-run", "--offline", *TINY, "--dry-run")
     assert "replay" not in ppo.out + ppo.err
     assert list(tmp_path.iterdir()) == []
@@ -102,7 +102,7 @@ def test_a_replay_that_was_kept_lets_the_run_go_on(library_home: Path, tmp_path:
     assert replay(folder) == FILES
     longer = sac_run("total_frames=64")
     assert (longer.code, longer.errors) == (0, [])
-    assert "continuing run at 32 frames" in " ".join(longer.err.split())
+    assert "resuming run at 32 frames" in " ".join(longer.err.split())
     assert read_json(folder / "result.json")["frames"] == 64
     assert not (folder / "replay").exists()
 
@@ -112,7 +112,7 @@ def test_a_run_that_died_before_its_result_still_has_its_replay(
 ) -> None:
     folder = tmp_path / "run"
     with monkeypatch.context() as patched:
-        patched.setattr("pgdm.experiment.write_json", _no_room)
+        patched.setattr("pgdm.runs.result.write_json", _no_room)
         assert sac_run().code == 1
     assert replay(folder) == FILES
     again = sac_run()
@@ -161,5 +161,5 @@ def test_a_start_that_is_refused_leaves_the_replay_as_it_was(
         assert sac_run("total_frames=64").errors
     assert not (folder / "replay").exists()
     monkeypatch.setattr("pgdm.experiment.check_assets", refuse)
-    monkeypatch.setattr("pgdm.experiment.Run._make_trainer", lambda *_: pytest.fail("too early"))
+    monkeypatch.setattr("pgdm.experiment._trainer", lambda *_: pytest.fail("too early"))
     assert "another network" in sac_run("total_frames=64").errors[0]

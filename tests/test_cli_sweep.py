@@ -1,4 +1,4 @@
-"""``pgdm sweep ...`` on sweeps that run, have ended, or are none."""
+"""``pgdm sweep ...`` on running and ended sweeps, and on folders without one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from command_line import Outcome, command
 from pgdm.sweep.ledger import Ending, Ledger
 from pgdm.sweep.plan import write_plan
 from pgdm.sweep.processes import Process
-from pgdm.sweep.state import log_path
+from pgdm.sweep.status import log_path
 from sweep_plans import plan
 
 ME = Process.of(os.getpid())
@@ -64,11 +64,11 @@ def test_status(ended: Path) -> None:
 
 
 def test_status_for_programs(ended: Path) -> None:
-    told = json.loads(sweep("status", ended, "--json").out)
-    assert (told["frames"], told["driven"]) == (48, False)
-    assert told["counts"] == {"waiting": 1, "finished": 1, "failed": 1}
-    assert [job["state"] for job in told["jobs"]] == ["finished", "failed", "waiting"]
-    assert told["jobs"][1]["error"] == "no room"
+    status = json.loads(sweep("status", ended, "--json").out)
+    assert (status["frames"], status["driven"]) == (48, False)
+    assert status["counts"] == {"waiting": 1, "finished": 1, "failed": 1}
+    assert [job["state"] for job in status["jobs"]] == ["finished", "failed", "waiting"]
+    assert status["jobs"][1]["error"] == "no room"
 
 
 def test_status_needs_neither_torch_nor_mlflow(ended: Path) -> None:
@@ -114,10 +114,10 @@ import sys
 from pathlib import Path
 from dataclasses import replace
 import sweep_plans
-from pgdm.cli.train import notify
+from pgdm.cli.sweep import FRONT
 from pgdm.sweep.launch import run_sweep
 plan = sweep_plans.plan(Path("study").absolute(), 3, *sys.argv[1:])
-sys.exit(run_sweep(plan, replace(sweep_plans.SWEEP, detach=True), sweep_plans.LOCAL, notify))
+sys.exit(run_sweep(plan, replace(sweep_plans.SWEEP, detach=True), sweep_plans.LOCAL, FRONT))
 """
 
 
@@ -142,27 +142,27 @@ def test_a_sweep_in_the_background(library_home: Path, tmp_path: Path) -> None:
         text=True,
     )
     limit = time.monotonic() + 120
-    while [j["frames"] > 0 for j in told(folder)["jobs"]] != [True, True, False]:
+    while [j["frames"] > 0 for j in status_of(folder)["jobs"]] != [True, True, False]:
         assert time.monotonic() < limit
         time.sleep(0.2)
     assert "running" in sweep("status", folder).out
-    assert told(folder)["driven"]
+    assert status_of(folder)["driven"]
     again = sweep("resume", folder)
     assert "already" in again.errors[0] and "pgdm sweep cancel" in again.errors[0]
 
     assert "cancelled 1 jobs" in sweep("cancel", folder, "seed=0").out
-    assert [job["state"] for job in told(folder)["jobs"]][:2] == ["cancelled", "running"]
-    assert "tried again by the sweep that runs" in sweep("retry", folder, "seed=0").out
+    assert [job["state"] for job in status_of(folder)["jobs"]][:2] == ["cancelled", "running"]
+    assert "retried by the running sweep" in sweep("retry", folder, "seed=0").out
     assert "cancelled 3 jobs" in sweep("cancel", folder).out
     out, err = watching.communicate(timeout=60)
     assert "3 cancelled" in out, err
-    assert [job["state"] for job in told(folder)["jobs"]] == ["cancelled"] * 3
+    assert [job["state"] for job in status_of(folder)["jobs"]] == ["cancelled"] * 3
     result = json.loads((folder / "runs" / "s1" / "result.json").read_text())
     assert result["status"] == "interrupted"
     assert "cancelled" in (folder / "logs" / "sweep.log").read_text()
 
 
-def told(folder: Path) -> dict:
+def status_of(folder: Path) -> dict:
     return json.loads(sweep("status", folder, "--json").out)
 
 

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 
 import pytest
 
+from pgdm.config.compose import compose
 from pgdm.config.identity import (
     ADDED_LATER,
     check_continues,
@@ -14,8 +16,8 @@ from pgdm.config.identity import (
     identity_hash,
     with_added_keys,
 )
-from pgdm.config.store import compose
 from pgdm.errors import RunError
+from pgdm.runs.config_file import dotted
 
 BESIDE = [
     "run_dir=elsewhere", "resume=must", "offline=true", "budget=smoke", "num_threads=1",
@@ -28,6 +30,13 @@ CHANGES = [
     "sim.solver_iterations=10", "sim.object_mass=published", "eval.episodes=5",
     "task.timestep_s=0.002", "pregrasp.fallback=null",
 ]  # fmt: skip
+
+
+def test_a_dataclass_is_flattened_as_its_plain_form() -> None:
+    cfg = compose(["task=dmanus-sim2real"])
+    flat = dotted(dataclasses.asdict(cfg))
+    assert list(dotted(cfg).items()) == list(flat.items())
+    assert flat["task.placements"][0]["body"] == cfg.task.placements[0].body
 
 
 @pytest.mark.parametrize("override", BESIDE)
@@ -43,7 +52,7 @@ def test_what_changes_the_result_changes_the_hash(override: str) -> None:
 
 
 def test_the_hash_is_the_same_in_every_process() -> None:
-    code = "from pgdm.config.store import compose; print(compose(['seed=3']).run_dir)"
+    code = "from pgdm.config.compose import compose; print(compose(['seed=3']).run_dir)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == compose(["seed=3"]).run_dir
 
@@ -77,11 +86,15 @@ def test_a_key_that_came_later_changes_no_identity_at_the_value_of_before() -> N
     changed = compose(["sim.object_mass=published"])
     assert difference(compose(), changed) == ["sim.object_mass: volume -> published"]
     assert difference(changed, compose()) == ["sim.object_mass: published -> volume"]
-    assert with_added_keys({"sim": {"a": 1}})["sim"] == {"object_mass": "volume", "a": 1}
+    assert with_added_keys({"sim": {"a": 1}})["sim"] == {
+        "engine": "mujoco",
+        "object_mass": "volume",
+        "a": 1,
+    }
     assert (
         with_added_keys({"sim": {"object_mass": "published"}})["sim"]["object_mass"] == "published"
     )
-    assert with_added_keys({"sim": None})["sim"] is None  # damaged: told by who builds it
+    assert with_added_keys({"sim": None})["sim"] is None  # damaged: reported when it is built
     assert with_added_keys({})["shaping"]["name"] == "none"  # a whole group that came later
 
 

@@ -9,11 +9,12 @@ import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from pgdm.config.compose import compose
 from pgdm.config.identity import ADDED_LATER, changes_result, identity
-from pgdm.config.saved import FILE, check_run_dir, load_config, save_config
-from pgdm.config.store import compose
-from pgdm.config.strict import flatten
+from pgdm.config.saved import check_run_dir, load_config, save_config
 from pgdm.errors import ConfigError, PgdmError, RunError
+from pgdm.runs.config_file import dotted
+from pgdm.runs.files import CONFIG
 
 STUDY = Path(__file__).resolve().parents[1] / "benchmark" / "results" / "study" / "runs"
 
@@ -25,7 +26,7 @@ STUDY = Path(__file__).resolve().parents[1] / "benchmark" / "results" / "study" 
 def test_what_was_saved_is_read_back(tmp_path: Path, overrides: list[str]) -> None:
     cfg = compose([*overrides, f"run_dir={tmp_path}"])
     file = save_config(cfg, tmp_path)
-    assert file.name == FILE
+    assert file.name == CONFIG
     assert load_config(tmp_path) == cfg
     assert list(tmp_path.iterdir()) == [file]
 
@@ -90,7 +91,7 @@ def test_an_edited_file_is_refused(tmp_path: Path, old: str, new: str, message: 
 @given(st.binary(max_size=200))
 def test_any_file_is_read_or_refused(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / FILE).write_bytes(content)
+        (Path(folder) / CONFIG).write_bytes(content)
         with pytest.raises(PgdmError):
             load_config(folder)
 
@@ -126,6 +127,6 @@ def test_a_run_older_than_a_key_is_read_and_is_the_same_experiment(tmp_path: Pat
 @pytest.mark.parametrize("setting", ["pgdm-residual", "distance_15cm-absolute"])
 def test_stored_runs_keep_their_identity(setting: str) -> None:
     folder = STUDY / setting / "door-open"
-    flat = flatten(yaml.safe_load((folder / FILE).read_text()))
+    flat = dotted(yaml.safe_load((folder / CONFIG).read_text()))
     del flat["format"]
     assert identity(load_config(folder)) == {k: v for k, v in flat.items() if changes_result(k)}

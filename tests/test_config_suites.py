@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pgdm.config.compose import compose
 from pgdm.config.groups import available
-from pgdm.config.store import compose
 from pgdm.config.suites import expand_tasks, suite, suites, task_facts
 from pgdm.errors import ConfigError, UnknownNameError
 
@@ -130,7 +130,7 @@ def test_a_suite_of_a_task_of_your_own(tmp_path: Path) -> None:
         ("tasks: duck-lift\n", r"either tasks: \[...\] or where"),
         ("tasks: [duck-lift]\nwhere: {tcdm30: true}\n", "either tasks"),
         ("tasks: [duck-lft]\n", "unknown task or suite 'duck-lft'"),
-        ("tasks: [duck\n", "mine.yaml is not valid YAML"),
+        ("tasks: [duck\n", "mine.yaml: not valid YAML"),
         ("- duck-lift\n", "mine.yaml holds no keys"),
         ("", "either tasks"),
     ],

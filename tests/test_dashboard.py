@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,9 +17,10 @@ from pathlib import Path
 import pytest
 
 from fake_runs import empty_database, end, make, train
-from pgdm.cli.dashboard import HOST, dashboard, free_port
+from pgdm.cli.dashboard import HOST, _command, dashboard, free_port
 from pgdm.errors import RunError
-from pgdm.tracking.run_folder import LINK, RunFolder, read_json
+from pgdm.runs.files import LINK, read_json
+from pgdm.runs.folder import RunFolder
 
 __all__ = ["empty_database"]  # a fixture
 
@@ -42,6 +44,28 @@ def test_folder_without_runs_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"no runs in .*runs'; `pgdm-run` starts one"):
         dashboard()
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("host", "allowed"),
+    [
+        ("127.0.0.1:5000", True),
+        ("localhost:8000", True),  # forwarded by ssh
+        ("10.evil.example", False),
+        ("192.168.evil.com", False),
+        ("192.168.evil.com:5000", False),
+        ("10.0.0.1:5000", False),
+        ("localhost.evil.com", False),
+    ],
+)
+def test_names_that_others_may_point_here_are_refused(
+    tmp_path: Path, host: str, allowed: bool
+) -> None:
+    from mlflow.server.security_utils import is_allowed_host_header
+
+    command = _command(f"sqlite:///{tmp_path}/x.db", tmp_path, 5000)
+    hosts = command[command.index("--allowed-hosts") + 1].split(",")
+    assert is_allowed_host_header(hosts, host) == allowed
 
 
 def test_server_has_pages_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
@@ -73,7 +97,7 @@ def served(folder: RunFolder, tmp_path: Path) -> Iterator[tuple[subprocess.Popen
     found = re.search(rf"http://{HOST}:\d+/\S+", "".join(lines))
     assert found, lines
     yield process, found.group()
-    process.send_signal(signal.SIGINT)  # a killed one could not end its server
+    process.send_signal(signal.SIGINT)  # if killed it could not stop its server
     process.wait(60)
     process.stdout.close()
 
@@ -116,7 +140,7 @@ def page_shows(url: str, texts: tuple[str, ...], tmp_path: Path) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ends_cleanly(
+def test_stops_cleanly(
     number: signal.Signals, served: tuple[subprocess.Popen[str], str], tmp_path: Path
 ) -> None:
     process, url = served
@@ -124,12 +148,16 @@ def test_ends_cleanly(
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     with direct.open(f"http://{HOST}:{port}/health", timeout=30) as answer:
         assert answer.status == 200
+    for host in ("10.evil.example", "192.168.evil.com", f"evil.example:{port}"):
+        request = urllib.request.Request(f"http://{HOST}:{port}/", headers={"Host": host})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            direct.open(request, timeout=30)
     with socket.socket() as probe:  # only this machine: not on the addresses others reach
         assert probe.connect_ex((HOST, port)) == 0
     assert len(group_of(port)) >= 2
     process.send_signal(number)
     assert process.wait(60) == 0
-    assert process.stdout is not None and "dashboard ended" in process.stdout.read()
+    assert process.stdout is not None and "dashboard closed" in process.stdout.read()
     deadline = time.monotonic() + 10
     while group_of(port):
         assert time.monotonic() < deadline
@@ -143,7 +171,9 @@ def test_browser_shows_the_run(
     served: tuple[subprocess.Popen[str], str], folder: RunFolder, tmp_path: Path
 ) -> None:
     _, url = served
-    assert page_shows(url, ("hammer-use1 s0 pgdm", "Model training"), tmp_path)
+    assert page_shows(
+        url, ("hammer-use1 s0 pgdm", "Model training", "eval_sampled/success"), tmp_path
+    )
     run_id = read_json(folder.path / LINK)["run_id"]
     page = url.split("/runs?")[0] + f"/runs/{run_id}"
     overview = ("Finished", "pregrasp_source", "asset_source", "eval_sampled/success")

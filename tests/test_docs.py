@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,11 +13,11 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from command_line import TINY, TINY_SAC, command, process
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.config.suites import expand_tasks
+from pgdm.runs.log import RunLog
 from pgdm.sweep.expand import grid
 from pgdm.sweep.studies import open_study
-from pgdm.tracking.run_log import RunLog
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
@@ -75,9 +76,11 @@ def test_settings_in_commands_exist(command: str) -> None:
     words = [word for word in words if word != "job"]
     study, typed, written = open_study(words)
     if study is not None or " -m " in command:
-        jobs = grid(OverridesParser.create().parse_overrides([*written, *typed]), expand_tasks)
+        jobs = grid(
+            OverridesParser.create().parse_overrides([*written, *typed]), expand_tasks, 10_000
+        )
         typed = [word for word in jobs[-1] if not word.startswith("hydra")]
-    compose(typed)
+    compose([word for word in typed if word != "device=cuda"])  # refused without a GPU
 
 
 def _follow(heading: str, folder: Path, page: str = "extending.md") -> None:
@@ -92,8 +95,8 @@ def _follow(heading: str, folder: Path, page: str = "extending.md") -> None:
         (folder / name).write_text(re.sub(r"(?m)^    ", "", body), encoding="utf-8")
 
 
-def test_recipe_for_a_suite_of_settings(tmp_path: Path) -> None:
-    _follow("A suite of settings", tmp_path)
+def test_recipe_for_a_named_experiment(tmp_path: Path) -> None:
+    _follow("A named experiment", tmp_path)
     cfg = compose(["+experiment=ours", "task=cup-pour1"], tmp_path / "my")
     assert (cfg.action.kind, cfg.algo.name, cfg.total_frames) == ("residual", "ppo_fast", 1_000_000)
     assert cfg.task.id == "cup-pour1"
@@ -104,7 +107,8 @@ def _author_commands(page: str, heading: str) -> list[list[str]]:
     section = (DOCS / page).read_text(encoding="utf-8").split(f"\n## {heading}\n")[1]
     section = section.split("\n## ")[0]
     return [
-        line.split()[1:] for line in re.findall(r"pgdm author (?:object|task) [^`\n]+", section)
+        line.split()[1:]
+        for line in re.findall(r"pgdm author (?:object|hand|task) [^`\n]+", section)
     ]
 
 
@@ -119,7 +123,7 @@ def _run_python(file: str) -> str:
 
 @pytest.fixture
 def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Search hands in a hurry: whether they are good is not asked here."""
+    """Search hand poses briefly: how good they are does not matter here."""
     from pgdm.pregrasp import near
 
     for name, count in {"STARTS": 2, "ROUNDS": 12}.items():
@@ -147,8 +151,25 @@ def test_recipes_for_an_object_and_its_task(
     assert command("pgdm", "author", "remove", "wedge-slide", "--yes").code == 0
 
 
+@pytest.mark.slow
+def test_the_tool_behind_the_animated_tasks(
+    tmp_path: Path, library_home: Path, hurried: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import animated_starts
+
+    task = "dhand-spheremedium-lift"
+    copy = shutil.copytree(animated_starts.animated.FOLDER, tmp_path / "keyframes")
+    monkeypatch.setattr(animated_starts.animated, "FOLDER", copy)
+    before = animated_starts.animated.read(task)
+    animated_starts.find(task, tmp_path)
+    after = animated_starts.animated.read(task)
+    assert after.object_joints == pytest.approx(before.object_joints, abs=1e-3)
+    assert after.hand_joints != pytest.approx(before.hand_joints, abs=1e-3)  # a short search
+    assert (tmp_path / f"{task}.png").is_file()
+
+
 def test_recipe_for_a_pregrasp_source(tmp_path: Path, library_home: Path) -> None:
-    _follow("A pre-grasp source", tmp_path)
+    _follow("A pre-grasp of your own", tmp_path)
     assert "deepest penetration: 0.0 mm" in _run_python("spread.py")
     done = command(
         "pgdm-run", "task=hammer-use1", "pregrasp=labeled", *TINY, "--offline", "run_dir=r"
@@ -194,6 +215,19 @@ def test_recipe_for_a_hand(tmp_path: Path, library_home: Path) -> None:
     whole = env_builder(compose(choices[:1]), open_library()).make(1, 1)
     # Each of the ten points less is a position, a quaternion and two velocities.
     assert whole.obs_dim - seen.obs_dim == 10 * (3 + 4 + 6)
+
+
+def test_recipe_for_a_hand_of_ones_own(tmp_path: Path, library_home: Path) -> None:
+    _follow("A hand", tmp_path)
+    _run_python("gripper.py")
+    (made,) = _author_commands("extending.md", "A hand")[:1]
+    outcome = command("pgdm", *made)
+    assert outcome.code == 0, outcome.err
+    assert "6: 3 with a servo each, 3 that follow" in outcome.out
+    run = ("task=cup-pour1", "hand=gripper", "pregrasp=none", "run_dir=run", *TINY)
+    done = command("pgdm-run", *run)
+    assert done.code == 0, done.err
+    assert command("pgdm", "author", "remove", "gripper", "--yes").code == 0
 
 
 def test_recipe_for_a_method(tmp_path: Path, library_home: Path) -> None:

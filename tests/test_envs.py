@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import gymnasium
@@ -14,7 +18,7 @@ import pgdm
 from pgdm.config.groups import available
 from pgdm.envs.batch_env import BatchEnv
 from pgdm.envs.divergence import replay
-from pgdm.errors import ConfigError, PgdmError, RunError, UnknownNameError
+from pgdm.errors import ConfigError, PgdmError, RenderError, RunError, UnknownNameError
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.render import Renderer
 
@@ -119,19 +123,23 @@ def test_state_goes_on_to_the_bit() -> None:
         assert torch.equal(got[0], obs) and torch.equal(got[1], reward)
 
 
-def test_sim2real_varies_friction_and_width_within_its_ranges() -> None:
+def test_sim2real_varies_friction_width_and_mass_within_their_ranges() -> None:
     env = pgdm.make_batch("dmanus-sim2real", num_envs=50, num_threads=2)
     geom = env.sim.scene.index.randomized_geom
-    friction, size = env.sim.contact()
+    friction, size, mass = env.sim.variation()
     assert size.min() >= 0.015 and size.max() <= 0.033 and size.std() > 0.003
     assert friction[:, 0].min() >= 0.3 and friction[:, 0].max() <= 0.7
     assert env.sim.scene.model.geom_priority[geom] == 10
+    assert mass.min() >= 0.1 and mass.max() <= 0.45 and mass.std() > 0.05
+    rise = env.sim.scene.model.joint("crackerbox/OBJTz").id
+    weights = [env.sim.data(row).qfrc_bias[rise] for row in range(50)]
+    assert weights == pytest.approx((9.81 * mass).tolist(), rel=1e-6)
 
 
 def test_a_diverging_simulation_ends_alone_and_is_dumped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pgdm.config.store import compose
+    from pgdm.config.compose import compose
     from pgdm.experiment import env_builder
     from pgdm.library import open_library
 
@@ -160,7 +168,7 @@ def test_a_diverging_simulation_ends_alone_and_is_dumped(
 
 
 def test_a_dump_keeps_nothing_of_the_episode_before(tmp_path: Path) -> None:
-    from pgdm.config.store import compose
+    from pgdm.config.compose import compose
     from pgdm.experiment import env_builder
     from pgdm.library import open_library
 
@@ -191,12 +199,12 @@ def test_stepping_on_after_the_end_is_refused() -> None:
 
 
 def test_evaluation_draws_other_boxes_than_training() -> None:
-    from pgdm.config.store import compose
+    from pgdm.config.compose import compose
     from pgdm.experiment import env_builder
     from pgdm.library import open_library
 
     builder = env_builder(compose(["task=dmanus-sim2real"]), open_library())
-    widths = [builder.make(3, 1, 0, stream).sim.contact()[1] for stream in ("train", "eval")]
+    widths = [builder.make(3, 1, 0, stream).sim.variation()[1] for stream in ("train", "eval")]
     assert not np.array_equal(*widths)
 
 
@@ -224,7 +232,7 @@ def test_weights_change_by_name_only() -> None:
 @pytest.mark.filterwarnings("ignore:.*A Box observation space:UserWarning")
 def test_gymnasium_env_passes_its_checker() -> None:
     env = gymnasium.make("pgdm/hammer-use1-v0", render_mode="rgb_array", pregrasp="planned")
-    check_env(env.unwrapped)
+    check_env(env.unwrapped, skip_render_check=True)  # it would open a window
     assert env.unwrapped.model.nu == 30
     env.reset(seed=0)
     picture = env.render()
@@ -233,6 +241,42 @@ def test_gymnasium_env_passes_its_checker() -> None:
     assert set(info) >= {"object_error_m", "success"}
     assert env.unwrapped.data.qpos.shape == (36,)
     env.close()
+
+
+def test_a_window_needs_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(RenderError, match="no screen to open a window on; use render_mode='rgb_"):
+        gymnasium.make("pgdm/hammer-use1-v0", render_mode="human")
+
+
+_PLAYED = """
+import time, gymnasium, pgdm
+env = gymnasium.make("pgdm/hammer-use1-v0", render_mode="human", offline=True)
+env.reset()
+begin = time.monotonic()
+for _ in range(10):
+    env.step(env.action_space.sample())
+assert time.monotonic() - begin > 9 / env.unwrapped.metadata["render_fps"]
+window = env.unwrapped._window
+assert window.is_open and env.render() is None
+"""
+
+
+@pytest.mark.skipif(shutil.which("Xvfb") is None, reason="needs Xvfb")
+@pytest.mark.parametrize("end", ["env.close(); assert not window.is_open", "pass"])
+def test_a_window_shows_each_step_in_real_time_and_closes_cleanly(end: str) -> None:
+    read, write = os.pipe()
+    screen = ["Xvfb", "-displayfd", str(write), "-screen", "0", "640x480x24"]
+    with subprocess.Popen(screen, pass_fds=[write], stderr=subprocess.DEVNULL) as server:
+        os.close(write)
+        display = os.read(read, 16).decode().strip()
+        env = {**os.environ, "DISPLAY": f":{display}"}
+        line = [sys.executable, "-c", _PLAYED + end]
+        done = subprocess.run(line, env=env, capture_output=True, text=True, check=False)
+        server.terminate()
+    os.close(read)
+    assert done.returncode == 0, done.stderr
 
 
 def test_gymnasium_names_the_valid_task() -> None:
@@ -253,6 +297,49 @@ def test_torchrl_env_keeps_its_specs_and_resets_rows() -> None:
     obs, reward, *_ = batch.step(rollout["action"][:, 0])
     torch.testing.assert_close(rollout["next", "observation"][:, 0], obs, rtol=0, atol=0)
     torch.testing.assert_close(rollout["next", "reward"][:, 0, 0], reward, rtol=0, atol=0)
+
+
+def test_stable_baselines3_gets_the_same_steps() -> None:
+    pytest.importorskip("stable_baselines3")
+    env = pgdm.make_sb3("dmanus-crackerbox", num_envs=2, num_threads=1)
+    batch = pgdm.make_batch("dmanus-crackerbox", num_envs=2, num_threads=1)
+    obs = env.reset()
+    assert obs.dtype == np.float32 and np.array_equal(obs, batch.reset().numpy())
+    ended = 0
+    for action in noise(batch, 60):
+        obs, reward, done, infos = env.step(action.numpy())
+        theirs, rewards, terminated, truncated, info = batch.step(action)
+        assert np.array_equal(obs, theirs.numpy()) and np.array_equal(reward, rewards.numpy())
+        assert done.dtype == bool and np.array_equal(done, (terminated | truncated).numpy())
+        for row in np.flatnonzero(done):
+            own = infos[row]
+            assert np.array_equal(own["terminal_observation"], info["final_obs"][row].numpy())
+            assert own["episode"]["r"] == own["episode_metrics"]["return"] > 0
+            assert own["episode"]["l"] > 1 and own["TimeLimit.truncated"] is False
+            ended += 1
+    assert ended >= 2
+    assert "terminal_observation" not in env.step(action.numpy())[3][0]
+    assert env.env_is_wrapped(object) == [False, False] and env.get_attr("render_mode", 0) == [None]
+
+
+def test_stable_baselines3_trains_on_all_simulations_at_once() -> None:
+    sb3 = pytest.importorskip("stable_baselines3")
+    env = pgdm.make_sb3("spheremedium-lift", num_envs=4, num_threads=1)
+    model = sb3.PPO("MlpPolicy", env, n_steps=64, batch_size=64, seed=0, device="cpu")
+    before = [p.clone() for p in model.policy.parameters()]
+    model.learn(256)
+    assert any(
+        not torch.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True)
+    )
+    assert len(model.ep_info_buffer) > 0  # its own record of returns and lengths
+
+
+def test_make_sb3_without_stable_baselines3_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("pgdm.make.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pip install -c constraints.txt -e '.\[sb3\]'"):
+        pgdm.make_sb3("hammer-use1")
 
 
 @pytest.mark.slow

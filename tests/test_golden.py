@@ -1,7 +1,7 @@
-"""Rollouts recorded from the released environment on MuJoCo 3.17 (motion_planned start).
+"""Comparison with rollouts of the released environment on MuJoCo 3.17 (motion_planned start).
 
-The physics is compared for the first steps, before contacts amplify rounding; every formula
-(observation, reward, end, running metrics) at every step, in the recorded states.
+The physics is compared over the first steps, before contacts amplify rounding; every formula
+(observation, reward, termination, metrics so far) at every step, in the recorded states.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ TASKS = [
 ]
 
 pytestmark = pytest.mark.skipif(
-    not GOLDEN.is_dir(), reason="golden rollouts lie beside the folder PGDM_TCDM_ROOT names"
+    not GOLDEN.is_dir(),
+    reason="needs the recorded rollouts, next to the folder that PGDM_TCDM_ROOT names",
 )
 
 
@@ -48,7 +49,7 @@ def test_reset_observation(golden: tuple[BatchEnv, dict]) -> None:
     np.testing.assert_allclose(env.reset()[0].numpy(), record["obs"][0], atol=1e-6)
 
 
-def test_warm_start_is_the_released_zero_action(golden: tuple[BatchEnv, dict]) -> None:
+def test_warm_start_is_the_zero_action_of_the_released_code(golden: tuple[BatchEnv, dict]) -> None:
     env, record = golden
     expected = record["zero_ac"].copy()
     expected[1] += 0.2
@@ -82,13 +83,12 @@ def test_formulas_at_every_recorded_state(golden: tuple[BatchEnv, dict]) -> None
     velocity_at = nq + 7 * num_bodies
     reference = mdp.reference
     horizon = len(reference)
-    start = env.reset().clone()
-    z0 = sim.read().object_pos[:, 2].clone()
+    env.reset()
+    state = sim.read()
+    z0 = state.object_pos[:, 2].clone()
     pos = torch.zeros(1, horizon, 3, dtype=torch.float64)
     quat = torch.zeros(1, horizon, 4, dtype=torch.float64)
-    state = sim.read()
     pos[:, 0], quat[:, 0] = state.object_pos, state.object_quat
-    del start
     for k in range(len(record["reward"])):
         qvel = record["obs"][k + 1][velocity_at : velocity_at + nv]
         sim.reset(np.array([0]), record["qpos"][k + 1], qvel)
@@ -97,7 +97,7 @@ def test_formulas_at_every_recorded_state(golden: tuple[BatchEnv, dict]) -> None
         target = reference.pos[t], reference.quat[t]
         context = StepContext(state, t, horizon - 1, *target, z0, sim.scene.index)
         reward = sum(float(r.weight * r.value(context)[0]) for r in mdp.recipe.rewards)
-        # Velocities of the points come from a recorded qvel in float32, so they are looser.
+        # Velocities of the points derive from a qvel recorded in float32: lower precision.
         np.testing.assert_allclose(
             mdp.observe(state, t)[0].numpy(), record["obs"][k + 1], atol=1e-5, rtol=1e-5
         )

@@ -5,27 +5,27 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-import mujoco
 import numpy as np
 import pytest
 
 from human_hand_points import flat_hand
-from pgdm.config.store import compose
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.library import open_library
-from pgdm.pregrasp.ik import HandIk, solve_hand, solve_targets
-from pgdm.pregrasp.keypoints import FINGERS, Keypoints
-from pgdm.pregrasp.mocap import object_joints, of_expert, of_hand, retarget
-from pgdm.sim.scene import Scene, build_scene
+from pgdm.pregrasp.hand_geometry import posed
+from pgdm.pregrasp.retarget.hand_ik import HandIk
+from pgdm.pregrasp.retarget.ik import solve_hand
+from pgdm.pregrasp.retarget.keypoints import FINGERS, Keypoints
+from pgdm.pregrasp.retarget.mocap import of_expert, of_hand, retarget
+from pgdm.pregrasp.sources import object_joints
+from pgdm.sim.scene import Scene
+from task_scenes import opened
 
 HANDS = {"adroit": 5, "dhand": 4, "dmanus": 3}
 pytestmark = pytest.mark.usefixtures("expert_home")
 
 
-@cache
-def scene(task: str, hand: str, *more: str) -> Scene:
-    cfg = compose([f"task={task}", f"hand={hand}", *more])
-    return build_scene(open_library(), cfg.task, cfg.hand, cfg.sim)
+def scene(task: str, hand: str, *settings: str) -> Scene:
+    return opened(task, hand, *settings)[0]
 
 
 @cache
@@ -34,15 +34,12 @@ def ik(task: str, hand: str) -> HandIk:
 
 
 def points(one: Scene, qpos: np.ndarray) -> np.ndarray:
-    data = mujoco.MjData(one.model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(one.model, data)
-    return data.geom_xpos[one.index.point_geoms].copy()
+    return posed(one, qpos).geom_xpos[one.index.point_geoms]
 
 
 @pytest.mark.parametrize("hand", HANDS)
-def test_a_hand_reaches_where_it_was(hand: str) -> None:
-    """A pose's own points are targets that can be reached exactly."""
+def test_a_hand_reaches_its_own_points(hand: str) -> None:
+    """The points of a pose are targets that can be reached exactly."""
     one = ik("hammer-use1", hand)
     model, nu = one.scene.model, one.scene.model.nu
     low, high = model.jnt_range[:nu].T
@@ -55,8 +52,8 @@ def test_a_hand_reaches_where_it_was(hand: str) -> None:
     targets = replace(
         one.shape.targets(human), points=wanted, weights=np.ones(len(wanted)), palm_weight=0.0
     )
-    result = solve_targets(one, targets, objects, free=False)
-    # The pull to the mean pre-grasp, 6 mm a radian, keeps it from the last millimetres.
+    result = one.result(one.track(targets, one.approach(objects, targets)), targets)
+    # The pull towards the mean pre-grasp, 6 mm per radian, leaves a few millimetres.
     assert result.fingertip_errors_m.max() < 0.006
     assert len(result.fingertip_errors_m) == HANDS[hand]
     np.testing.assert_array_equal(result.qpos[nu:], objects)
@@ -76,7 +73,7 @@ def test_a_hand_reaches_where_it_was(hand: str) -> None:
         ),
     ],
 )
-def test_a_person_s_grasp_is_taken_up_free_of_everything(task: str, hand: str) -> None:
+def test_a_human_grasp_is_followed_without_contact(task: str, hand: str) -> None:
     one, library = scene(task, hand), open_library()
     motion = library.motion(task)
     made = retarget(one, library, motion, of_expert(library.expert(task), motion))
@@ -85,12 +82,9 @@ def test_a_person_s_grasp_is_taken_up_free_of_everything(task: str, hand: str) -
     low, high = one.model.jnt_range[: one.model.nu].T
     hand_qpos = made.result.qpos[: one.model.nu]
     assert (hand_qpos >= low).all() and (hand_qpos <= high).all()
-    # The thumb is on one side of the object and the other fingers on the other.
+    # The thumb is on one side of the object and the fingers are on the other.
     tips = points(one, made.result.qpos)[one.index.fingertips]
-    data = mujoco.MjData(one.model)
-    data.qpos[:] = made.result.qpos
-    mujoco.mj_kinematics(one.model, data)
-    across = tips - data.xipos[one.index.object_body]
+    across = tips - posed(one, made.result.qpos).xipos[one.index.object_body]
     if task == "cup-drink1":
         thumb = across[made.fingers.index("thumb")]
         assert all(thumb[:2] @ other[:2] < 0 for other in np.delete(across, -1, axis=0))
@@ -104,22 +98,7 @@ def test_equal_arguments_give_an_equal_pose() -> None:
     np.testing.assert_array_equal(first.qpos, second.qpos)
 
 
-def test_a_drag_is_quick_and_stays_where_it_was() -> None:
-    """Another call from the last pose with one fingertip moved changes little else."""
-    library, one = open_library(), ik("flute-pass1", "adroit")
-    motion = library.motion("flute-pass1")
-    objects = object_joints(motion, one.scene)
-    hand = Keypoints.of(library.expert("flute-pass1").human_joints[0])
-    first = solve_hand(one, hand, objects, free=False)
-    moved = first.targets.points.copy()
-    moved[one.shape.rows[0, 2]] += [0.0, 0.0, 0.01]
-    targets = replace(first.targets, points=moved)
-    second = solve_targets(one, targets, objects, start=first.qpos, free=False)
-    assert second.fingertip_errors_m[0] < 0.006
-    assert np.abs(second.qpos - first.qpos)[:6].max() < 0.1
-
-
-def test_avoidance_keeps_what_is_free_out_of_the_object() -> None:
+def test_avoidance_keeps_a_free_hand_out_of_the_object() -> None:
     library, one = open_library(), ik("flute-pass1", "adroit")
     objects = object_joints(library.motion("flute-pass1"), one.scene)
     targets = one.shape.targets(Keypoints.of(library.expert("flute-pass1").human_joints[0]))
@@ -131,7 +110,7 @@ def test_avoidance_keeps_what_is_free_out_of_the_object() -> None:
     assert through > 0.003 > around
 
 
-def test_fingers_follow_those_that_the_settings_name() -> None:
+def test_fingers_follow_the_human_fingers_of_the_settings() -> None:
     human = Keypoints.of(flat_hand()).moved(np.eye(3), np.array([0.0, 0.0, 0.3]))
     shape = ik("hammer-use1", "dhand").shape
     assert shape.fingers == ("index", "middle", "little", "thumb")
@@ -140,7 +119,7 @@ def test_fingers_follow_those_that_the_settings_name() -> None:
     assert 2.0 < targets.scale < 3.0
     for row, name in zip(shape.rows, shape.fingers, strict=True):
         np.testing.assert_allclose(targets.points[row[2]], human.pads[FINGERS.index(name)])
-    # Adroit's knuckle of the index finger lies in the human one's direction, at Adroit's distance.
+    # Adroit's index knuckle is in the direction of the human one, at Adroit's distance.
     targets = ik("hammer-use1", "adroit").shape.targets(human)
     assert targets.anchor == "wrist"
     np.testing.assert_array_equal(targets.points[0], human.wrist)
@@ -154,7 +133,7 @@ def test_fingers_follow_those_that_the_settings_name() -> None:
 
 @pytest.mark.slow
 def test_a_robot_s_pose_is_a_human_hand_for_another() -> None:
-    """Any motion, any hand: D'Hand's labeled pre-grasp of the cup for Adroit and D'Manus."""
+    """Any task, any hand: D'Hand's pre-grasp of the cup for Adroit and D'Manus."""
     library = open_library()
     motion = library.motion("dhand-cup")
     human = of_hand(scene("dhand-cup", "dhand"), motion.starts["mined"])
@@ -170,10 +149,10 @@ def test_a_robot_s_pose_is_a_human_hand_for_another() -> None:
     [
         ("hand.human_fingers=[index,ring]", "names 2 fingers, hand.fingertips has 3"),
         ("hand.human_fingers=[index,ring,toe]", "'toe'"),
-        ("hand.human_fingers=[index,index,thumb]", "needs a human finger of its own"),
+        ("hand.human_fingers=[index,index,thumb]", "needs its own human finger"),
         ("hand.fingertips=[2,6,9]", "knuckle, middle and distal"),
     ],
 )
-def test_settings_that_do_not_fit_are_named(setting: str, message: str) -> None:
+def test_settings_that_do_not_fit_are_refused(setting: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         HandIk(scene("hammer-use1", "dmanus", setting))

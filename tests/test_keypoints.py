@@ -1,4 +1,4 @@
-"""Human hands from files: what is read, and what is refused with a clear reason."""
+"""Human hands from files: what is read, and what is refused for which reason."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from human_hand_points import flat_hand
 from pgdm.errors import ConfigError, CorruptAssetError, PgdmError, UnknownNameError
-from pgdm.pregrasp import recording
-from pgdm.pregrasp.keypoints import FINGERS, Keypoints, filled
+from pgdm.pregrasp.retarget import recording
+from pgdm.pregrasp.retarget.keypoints import FINGERS, Keypoints, filled
 
 
 def as_openpose(hand: Keypoints) -> np.ndarray:
@@ -34,7 +34,7 @@ def test_both_orders_name_the_same_joints() -> None:
     np.testing.assert_array_equal(hand.fingers[0, 0], points[1])  # index finger's knuckle
     np.testing.assert_array_equal(hand.fingers[4, 2], points[15])  # thumb's last joint
     np.testing.assert_array_equal(hand.joints, points)
-    # No tips in the file: 2 cm along the bone before.
+    # Without tips: 2 cm along the bone before.
     np.testing.assert_allclose(hand.fingers[1, 3] - hand.fingers[1, 2], [0.0, 0.02, 0.0])
     np.testing.assert_allclose(hand.pads[1], hand.fingers[1, 2] + [0.0, 0.01, 0.0])
     for points, order in ((as_openpose(hand), None), (as_mano(hand), "mano")):
@@ -45,7 +45,7 @@ def test_axes_of_a_palm_that_faces_down() -> None:
     hand = Keypoints.of(flat_hand())
     np.testing.assert_allclose(hand.palm()[:, 2], [0, 0, 1], atol=1e-9)  # out of the back
     assert hand.palm()[0, 0] > 0.99  # from the index to the little finger
-    # The little finger's knuckle is farthest out, 98.5 mm from the wrist; then 40 + 25 mm, then
+    # The little finger's knuckle is the farthest, 98.5 mm from the wrist; then 40 + 25 mm, then
     # half of the last 20 mm.
     assert hand.span_m == pytest.approx(np.hypot(0.04, 0.09) + 0.075)
 
@@ -53,18 +53,18 @@ def test_axes_of_a_palm_that_faces_down() -> None:
 @pytest.mark.parametrize(
     ("factor", "unit"), [(1000.0, "millimetres"), (100.0, "centimetres")], ids=["mm", "cm"]
 )
-def test_other_units_are_named(factor: float, unit: str) -> None:
+def test_other_units_are_recognised(factor: float, unit: str) -> None:
     with pytest.raises(ConfigError, match=f"look like {unit}.*metres"):
         Keypoints.of(factor * flat_hand())
 
 
-def test_a_left_hand_is_told() -> None:
+def test_a_left_hand_is_recognised() -> None:
     with pytest.raises(ConfigError, match="left hand"):
         Keypoints.of(flat_hand() * [-1, 1, 1])
 
 
 @pytest.mark.usefixtures("expert_home")
-def test_every_recorded_hand_is_taken_and_its_mirror_image_is_not() -> None:
+def test_every_recorded_hand_is_accepted_and_its_mirror_image_is_not() -> None:
     from pgdm.library import open_library
 
     library = open_library()
@@ -76,7 +76,7 @@ def test_every_recorded_hand_is_taken_and_its_mirror_image_is_not() -> None:
                 Keypoints.of(points * [1, -1, 1], label=task)
 
 
-def test_bones_that_no_hand_has() -> None:
+def test_impossible_bones_are_refused() -> None:
     points = flat_hand()
     points[3] = points[2]
     with pytest.raises(ConfigError, match=r"index finger, middle to distal: 0 m"):
@@ -95,7 +95,7 @@ def test_bones_that_no_hand_has() -> None:
         Keypoints.of(flat_hand(), "mediapipe")
 
 
-def test_fingers_that_were_not_measured_lie_beside_those_that_were() -> None:
+def test_fingers_that_were_not_measured_are_filled_in() -> None:
     hand = Keypoints.of(flat_hand())
     known = {name: hand.fingers[FINGERS.index(name)] for name in ("index", "ring", "thumb")}
     whole = filled(hand.wrist, known)
@@ -109,7 +109,7 @@ def test_fingers_that_were_not_measured_lie_beside_those_that_were() -> None:
 
 
 def write(path: Path, joints: np.ndarray, **more: object) -> Path:
-    """Write a file of joints in the format that its ending names."""
+    """Write a file of joints in the format of its extension."""
     if path.suffix == ".npz":
         np.savez(path, joints=joints, **more)  # type: ignore[arg-type]
     elif path.suffix == ".json":
@@ -147,19 +147,19 @@ def test_the_objects_pose_comes_with_it(ending: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.json", "[1, 2]", "no JSON object"),
-        ("a.json", "{", "no JSON"),
+        ("a.json", "[1, 2]", "not a JSON object"),
+        ("a.json", "{", "not JSON"),
         ("a.json", '{"points": []}', r"key in .*'points'; did you mean joints"),
         ("a.json", '{"order": "mano"}', "lacks 'joints'"),
-        ("a.json", '{"joints": [[1, 2], [3]]}', "no array of numbers"),
+        ("a.json", '{"joints": [[1, 2], [3]]}', "not an array of numbers"),
         ("a.json", '{"joints": [[[]]]}', "16 joints or 21"),
         ("a.csv", "x,y,z\n1,2,3\n", "frame,joint,x,y,z"),
         ("a.csv", "frame,joint,x,y,z\n0,0,1,2\n", "row 2"),
-        ("a.csv", "frame,joint,x,y,z\n0,0,1,2,3\n0,0,1,2,3\n", "joint 0 of frame 0 again"),
+        ("a.csv", "frame,joint,x,y,z\n0,0,1,2,3\n0,0,1,2,3\n", "repeats joint 0 of frame 0"),
         ("a.csv", "frame,joint,x,y,z\n0,15,1,2,3\n", "1 rows for 1 frames"),
         ("a.csv", "", "frame,joint,x,y,z"),
         ("a.npz", "no zip", "not a readable .npz"),
-        ("a.txt", "", r"ending of a.txt"),
+        ("a.txt", "", r"extension of a.txt"),
     ],
 )
 def test_a_damaged_file_is_named(name: str, content: str, message: str, tmp_path: Path) -> None:
@@ -181,6 +181,21 @@ def test_wrong_poses_are_named(tmp_path: Path) -> None:
         recording.read(evil)
 
 
+def test_the_order_of_the_objects_quaternion_can_be_named(tmp_path: Path) -> None:
+    turned = [0.6, 0.8, 0.0, 0.0]
+    pose = {"object_position": [0.0, 0.0, 0.0], "object_orientation": turned}
+    bare = recording.read(write(tmp_path / "a.npz", flat_hand(), **pose))
+    assert bare.orientation.tolist() == [turned] and not bare.ordered
+    assert "read as w x y z" in bare.origin
+    pose = {"object_position": [0.0, 0.0, 0.0], "object_orientation": [0.8, 0.0, 0.0, 0.6]}
+    named = write(tmp_path / "b.npz", flat_hand(), **pose, object_orientation_order="xyzw")
+    assert recording.read(named).orientation.tolist() == [turned]
+    assert recording.read(named).ordered
+    wrong = write(tmp_path / "c.npz", flat_hand(), **pose, object_orientation_order="wzyx")
+    with pytest.raises(PgdmError, match=r"object_orientation_order.*valid: wxyz, xyzw"):
+        recording.read(wrong)
+
+
 @given(
     st.recursive(
         st.none() | st.booleans() | st.floats() | st.text(max_size=5),
@@ -189,18 +204,18 @@ def test_wrong_poses_are_named(tmp_path: Path) -> None:
     ),
     st.sampled_from(["joints", "order", "object_position", "object_orientation"]),
 )
-def test_whatever_a_file_holds_the_error_is_ours(value: object, key: str) -> None:
+def test_any_content_raises_only_our_errors(value: object, key: str) -> None:
     with contextlib.suppress(PgdmError):
         recording.parse({"joints": flat_hand().tolist(), key: value}, "file")
 
 
 def test_ragged_poses_are_named() -> None:
-    with pytest.raises(CorruptAssetError, match="'object_position' is no array of numbers"):
+    with pytest.raises(CorruptAssetError, match="'object_position' is not an array of numbers"):
         recording.parse({"joints": flat_hand(), "object_position": [[0, 0, 0], [1]]}, "file")
 
 
 @given(st.integers(0, 15), st.integers(0, 2), st.floats())
-def test_one_wrong_number_is_refused_or_still_a_hand(joint: int, axis: int, value: float) -> None:
+def test_a_changed_number_is_refused_or_still_a_hand(joint: int, axis: int, value: float) -> None:
     points = flat_hand()
     points[joint, axis] = value
     try:

@@ -23,8 +23,8 @@ from PIL import Image
 from viser import _messages
 
 from labeler_scenes import page_of
-from pgdm.library import pregrasp_file
-from pgdm.pregrasp.labeler import store
+from pgdm.library.files import pregrasp as pregrasp_file
+from pgdm.pregrasp.labeler import poses as store
 from pgdm.pregrasp.labeler.guard import HOST
 from pgdm.pregrasp.labeler.page import LabelPage
 from pgdm.pregrasp.labeler.panel import PAUSE_S
@@ -37,8 +37,8 @@ pytestmark = [
 
 TASK = "hammer-use1"
 PATIENCE_S = 120.0
-SIZE = 760, 480  # of the page, pixels: its panel takes 324 of them
-HEIGHT = 1  # the wrist's height in qpos
+SIZE = 760, 480  # of the page, pixels; the panel takes 324 of the width
+HEIGHT = 1  # index of the wrist's height in qpos
 INPUT = (
     "(() => { const name = [...document.querySelectorAll('*')].filter(e => !e.children.length && "
     "e.innerText === '%s')[0]; let row = name; while (!row.querySelector('input[type=text]')) "
@@ -71,19 +71,19 @@ def opened(chrome: Chromium, page: LabelPage) -> Tab:
     before = len(page.server.get_clients())
     tab.open(page.url, "touches nothing")
     until(lambda: len(page.server.get_clients()) > before)
-    until(lambda: colours(tab) > 100)  # an empty page has a few
+    until(lambda: colours(tab) > 100)  # an empty page has only a few
     return tab
 
 
 def colours(tab: Tab) -> int:
-    """Return how many different colours are seen where hand and object are."""
+    """Return the number of colours in the region of hand and object."""
     with Image.open(io.BytesIO(tab.picture())) as picture:
         seen = np.asarray(picture.convert("RGB"))[100:400, 50:400].reshape(-1, 3)
     return len(np.unique(seen // 8, axis=0))
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait until something is so; a busy machine gets its time."""
+    """Wait for a condition, long enough for a busy machine."""
     end = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end
@@ -91,7 +91,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 def pixel(client: viser.ClientHandle, point: np.ndarray) -> tuple[float, float]:
-    """Return where a point (3,) m, world frame, is seen on a page."""
+    """Return the pixel of a point (3,) m, world frame, on a page."""
     camera = client.camera
     x, y, z = viser.transforms.SO3(camera.wxyz).as_matrix().T @ (point - camera.position)
     scale = camera.image_height / 2 / np.tan(camera.fov / 2) / z
@@ -99,11 +99,16 @@ def pixel(client: viser.ClientHandle, point: np.ndarray) -> tuple[float, float]:
 
 
 def drag(tab: Tab, page: LabelPage, handle: viser.TransformControlsHandle, shift_m: float) -> None:
-    """Drag a handle along its third axis by its arrow."""
+    """Drag the arrow of a handle along its third axis."""
     client = next(iter(page.server.get_clients().values()))
     axis = viser.transforms.SO3(np.array(handle.wxyz)).as_matrix()[:, 2]
     grip = np.array(handle.position) + 0.9 * handle.scale * axis
     tab.drag(pixel(client, grip), pixel(client, grip + shift_m * axis))
+
+
+def released(page: LabelPage) -> bool:
+    """Return whether no handle is being dragged, and the page has followed the last one."""
+    return page.dragged is None and page.mailbox.wait(5)
 
 
 def test_page_shows_the_scene(tab: Tab, page: LabelPage) -> None:
@@ -118,7 +123,7 @@ def test_typing_and_undo(tab: Tab, page: LabelPage) -> None:
     state, before = page.state, page.state.qpos[HEIGHT]
     tab.type_into(INPUT % "height [mm]", "-150")
     until(lambda: abs(state.qpos[HEIGHT] + 0.15) < 1e-9)
-    time.sleep(PAUSE_S)  # or it is one movement of the slider
+    time.sleep(PAUSE_S)  # otherwise both are one gesture of the slider
     tab.type_into(INPUT % "height [mm]", "-9999")  # its limit is -200
     until(lambda: abs(state.qpos[HEIGHT] + 0.2) < 1e-9)
     tab.wait("document.body.innerText.includes(' mm inside ')")
@@ -133,12 +138,12 @@ def test_typing_and_undo(tab: Tab, page: LabelPage) -> None:
     until(lambda: state.qpos[HEIGHT] == before)
 
 
-def test_presets_and_two_pages_at_once(chrome: Chromium, tab: Tab, page: LabelPage) -> None:
+def test_presets_on_two_open_pages(chrome: Chromium, tab: Tab, page: LabelPage) -> None:
     other = opened(chrome, page)
     tab.click_button("none")
     until(lambda: not page.state.qpos[:30].any())
     for one in (tab, other):
-        one.wait("document.body.innerText.includes('took the reset pose')")
+        one.wait("document.body.innerText.includes('loaded the reset pose')")
         one.wait(f"{INPUT % 'height [mm]'}.value === '0'")
     other.type_into(INPUT % "height [mm]", "50")
     until(lambda: abs(page.state.qpos[HEIGHT] - 0.05) < 1e-9)
@@ -150,16 +155,15 @@ def test_handles_are_dragged(tab: Tab, page: LabelPage) -> None:
     stage, state = page.stage, page.state
     before = state.qpos
     drag(tab, page, stage.wrist, 0.05)
-    until(lambda: not np.array_equal(state.qpos[:6], before[:6]) and page.mailbox.wait(5))
+    until(lambda: not np.array_equal(state.qpos[:6], before[:6]) and released(page))
     np.testing.assert_array_equal(state.qpos[6:], before[6:])
     moved = state.kinematics.wrist_pose(state.qpos)[0] - state.kinematics.wrist_pose(before)[0]
     assert 0.01 < np.linalg.norm(moved) < 0.15
     placed = state.qpos
     drag(tab, page, stage.tips[0], 0.02)
-    until(lambda: not np.array_equal(state.qpos[8:12], placed[8:12]) and page.mailbox.wait(5))
+    until(lambda: not np.array_equal(state.qpos[8:12], placed[8:12]) and released(page))
     np.testing.assert_array_equal(state.qpos[12:], placed[12:])
-    until(lambda: page.mailbox.wait(5) and page.idle)
-    # Let go of, the handle jumps back onto the fingertip.
+    # Once released, the handle jumps back to the fingertip.
     tip = state.kinematics.tip(state.qpos, 0)
     until(lambda: np.allclose(stage.tips[0].position, tip, atol=1e-6))
     tab.click_button("Undo")
@@ -171,13 +175,13 @@ def test_handles_are_dragged(tab: Tab, page: LabelPage) -> None:
 def test_saving(tab: Tab, page: LabelPage) -> None:
     path = store.path(page.state.scene)
     tab.type_into(INPUT % "height [mm]", "-200")
-    until(lambda: not page.state.figures.free and page.mailbox.wait(5))
+    until(lambda: not page.state.metrics.free and page.mailbox.wait(5))
     until(lambda: store.draft_path(page.state.scene).is_file())
     tab.click_button("Save")
-    tab.wait("document.body.innerText.includes('not saved: a pre-grasp touches nothing')")
+    tab.wait("document.body.innerText.includes('not saved: a pre-grasp must touch nothing')")
     assert not path.exists()
     tab.click_button("Save anyway")
-    tab.wait("document.body.innerText.includes('pgdm-run task=hammer-use1 pregrasp=labeled')")
+    tab.wait("document.body.innerText.includes('task=hammer-use1 hand=adroit pregrasp=labeled')")
     found = pregrasp_file.read(path)
     np.testing.assert_array_equal(found.pose.qpos, page.state.qpos)
     assert "inside" in found.note["saved_anyway"] and found.reached is None
@@ -185,11 +189,11 @@ def test_saving(tab: Tab, page: LabelPage) -> None:
 
 
 def test_trial_is_shown_and_saved(tab: Tab, page: LabelPage) -> None:
-    tab.type_into(INPUT % "height [mm]", "-200")  # in the table: the search does not end soon
-    until(lambda: not page.state.figures.free and page.mailbox.wait(5))
+    tab.type_into(INPUT % "height [mm]", "-200")  # in the table: the search takes long
+    until(lambda: not page.state.metrics.free and page.mailbox.wait(5))
     tab.click_button("Try it")
-    tab.wait("document.body.innerText.includes('planning the way there: round')", PATIENCE_S)
-    tab.type_into(INPUT % "height [mm]", "-150")  # the page still listens
+    tab.wait("document.body.innerText.includes('planning the reach: round')", PATIENCE_S)
+    tab.type_into(INPUT % "height [mm]", "-150")  # the page still responds
     until(lambda: abs(page.state.qpos[HEIGHT] + 0.15) < 1e-9)
     assert not page.idle
     tab.click_button("Cancel")
@@ -199,9 +203,9 @@ def test_trial_is_shown_and_saved(tab: Tab, page: LabelPage) -> None:
     tab.click_button("Try it")
     tab.wait("document.body.innerText.includes('of random closing policies lift it')", PATIENCE_S)
     until(lambda: page.idle)
-    assert "the hand gets there" in tab.text()
+    assert "the hand reaches the pose" in tab.text()
     tab.click_button("Save")
-    tab.wait("document.body.innerText.includes('saved with the way there')", PATIENCE_S)
+    tab.wait("document.body.innerText.includes('saved pose and reach')", PATIENCE_S)
     found = pregrasp_file.read(store.path(page.state.scene))
     assert found.reached is not None and found.reached.actions is not None
     assert found.note["reached"] and 0.0 <= found.note["lift_rate"] <= 1.0
@@ -236,7 +240,7 @@ def test_pages_of_other_sites_and_tunnels_are_refused(page: LabelPage) -> None:
 
 
 def started(port: int, *options: str) -> tuple[subprocess.Popen[str], str, str]:
-    """Start the command; return it with what it printed and the page's address."""
+    """Start the command; return it with its output so far and the page's URL."""
     command = [sys.executable, "-c", PROGRAM, "pregrasp", "label", TASK, "--no-browser"]
     process = subprocess.Popen(
         [*command, "--port", str(port), *options],
@@ -263,7 +267,7 @@ def ended(process: subprocess.Popen[str], number: signal.Signals) -> str:
     return output
 
 
-def test_command_keeps_the_draft_whatever_ends_it(chrome: Chromium) -> None:
+def test_command_keeps_the_draft_however_it_is_stopped(chrome: Chromium) -> None:
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         taken.listen()
@@ -281,18 +285,21 @@ def test_command_keeps_the_draft_whatever_ends_it(chrome: Chromium) -> None:
             text=True,
             check=False,
         )
-        assert second.returncode == 1 and second.stderr.count("\n") == 1
+        assert (
+            second.returncode == 1
+            and second.stderr.removeprefix("loading torch and MuJoCo\n").count("\n") == 1
+        )
         assert "is open in another labeler" in second.stderr
         ended(process, signal.SIGKILL)
     process, printed, url = started(0)
     assert "draft of " in printed and "port 0" not in printed
-    tab.open(url, "not saved then")
+    tab.open(url, "unsaved draft of")
     tab.wait(f"{INPUT % 'height [mm]'}.value === '-140'")
     tab.type_into(INPUT % "height [mm]", "-130")
     tab.wait(f"{INPUT % 'height [mm]'}.value === '-130'")
-    time.sleep(0.5)  # on its way
+    time.sleep(0.5)  # until the server has it
     output = ended(process, signal.SIGINT)
-    assert process.returncode == 0 and "labeler ended; what is not saved is kept: " in output
+    assert process.returncode == 0 and "labeler closed; the unsaved draft is kept: " in output
     kept = pregrasp_file.read(user / "labeled.draft.npz")
     assert abs(kept.pose.qpos[HEIGHT] + 0.13) < 1e-9
     process, printed, _ = started(0, "--from", "mined")
@@ -301,7 +308,27 @@ def test_command_keeps_the_draft_whatever_ends_it(chrome: Chromium) -> None:
     assert process.returncode == 0
 
 
-def test_label_trains(tmp_path: Path) -> None:
+def test_an_earlier_label_is_replaced_only_if_confirmed() -> None:
+    with page_of(TASK) as page:
+        path = store.path(page.state.scene)
+        page.save()
+        assert page.mailbox.wait()
+        page.mailbox.post(lambda: page.state.set_joint(9, 0.6))
+        page.save()  # its own, a moment ago
+        assert page.mailbox.wait()
+    first = pregrasp_file.read(path).pose.qpos
+    with page_of(TASK) as page:
+        page.mailbox.post(lambda: page.state.set_joint(9, 0.3))
+        page.save()
+        assert page.mailbox.wait()
+        assert page.panel._anyway.visible
+        np.testing.assert_array_equal(pregrasp_file.read(path).pose.qpos, first)
+        page.save(anyway=True)
+        assert page.mailbox.wait()
+        assert pregrasp_file.read(path).pose.qpos[9] == 0.3
+
+
+def test_a_labeled_pregrasp_trains(tmp_path: Path) -> None:
     with page_of(TASK) as page:
         page.mailbox.post(lambda: page.state.set_joint(9, 0.6))
         page.save()

@@ -1,9 +1,13 @@
-"""The house's one direction: who may import whom, read from the source without running it."""
+"""Who may import whom, read from the source without running it.
+
+The tables here are the source of those in docs/architecture.md.
+"""
 
 from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -11,11 +15,11 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parents[1]
 PACKAGE = REPOSITORY / "src" / "pgdm"
 
-# From the ground up: a room imports from itself and from floors below its own, never from another
-# room on its floor. docs/architecture.md draws this table.
-FLOORS: list[set[str]] = [
+# From the lowest up: a package or module directly in pgdm imports from itself and from layers below
+# its own, never from another one in its layer.
+LAYERS: list[set[str]] = [
     {"errors"},
-    {"rotations", "seeding", "cem", "paths", "stop"},
+    {"rotations", "seeding", "cem", "files", "limited", "memory", "paths", "stop", "moved"},
     {"library"},
     {"motion"},
     {"sim"},
@@ -24,50 +28,58 @@ FLOORS: list[set[str]] = [
     {"envs"},
     {"methods"},
     {"rl"},
+    {"runs"},
     {"tracking"},
     {"config"},
     {"experiment"},
     {"make"},  # environments by task id
     {"pgdm"},  # the package's own __init__: what `import pgdm` offers
-    {"sweep", "author"},
-    {"report"},
-    {"cli", "realworld"},
-    {"hydra_plugins"},
+    {"sweep", "author", "deploy", "export"},
+    {"report", "zoo"},
+    {"cli"},
+    {"__main__"},
 ]
-BASE = FLOORS[0] | FLOORS[1]
+BASE = LAYERS[0] | LAYERS[1]
 
-# Rooms that see less than their floor allows: learning knows neither simulator nor methods.
+# Packages that may import less than their layer allows: `rl` knows neither simulator nor methods.
 NARROW: dict[str, set[str]] = {"rl": BASE}
 
-# Who may import a third-party package; a package that is not listed may be imported anywhere.
+# Where a third-party package is imported, and nowhere else; one that is not listed may be imported
+# anywhere.
 ALLOWED: dict[str, set[str]] = {
-    "mujoco": {"library", "motion", "sim", "pregrasp", "wrist", "author", "realworld"},
+    "mujoco": {"library", "sim", "pregrasp", "wrist", "author", "deploy", "export"},
     "torchrl": {"envs.torchrl", "rl"},
-    "hydra": {"config.store", "sweep.expand", "cli", "hydra_plugins"},
-    "omegaconf": {"config.store", "sweep.expand", "sweep.planning", "cli", "hydra_plugins"},
+    "hydra": {
+        "config.compose",
+        "config.explain",
+        "config.hydra_private",
+        "sweep.expand",
+        "cli.jobs",
+    },
+    "omegaconf": {"config.compose", "config.explain", "config.hydra_private", "cli.jobs"},
     "mlflow": {"tracking", "report"},
     "submitit": {"sweep.slurm"},
-    "mink": {"pregrasp"},
+    "mink": {"pregrasp", "deploy"},
     "qpsolvers": {"wrist"},
     "viser": {"pregrasp"},
     "trimesh": {"library", "pregrasp"},
     "coacd": {"library"},
     "h5py": {"pregrasp"},
+    "stable_baselines3": {"envs.sb3"},
+    "safetensors": {"export"},
+    "minari": {"export"},
 }
 
 Sources = dict[str, str]  # "sim.batch" -> its source; the package's own __init__ is "pgdm"
 
 
 def read_sources() -> Sources:
-    """Return the source of every module, a room's ``__init__`` under the room's name."""
+    """Return the source of every module, a package's ``__init__`` under the package's name."""
     sources: Sources = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
         parts = parts[:-1] if parts[-1] == "__init__" else parts
         sources[".".join(parts) or "pgdm"] = path.read_text(encoding="utf-8")
-    for path in sorted((REPOSITORY / "src" / "hydra_plugins").rglob("*.py")):
-        inner = path.relative_to(REPOSITORY / "src").with_suffix("").parts
-        sources[".".join(inner)] = path.read_text(encoding="utf-8")
     return sources
 
 
@@ -81,47 +93,84 @@ class _NoTypeOnly(ast.NodeTransformer):
         return self.generic_visit(node)
 
 
-def imported(module: str, sources: Sources, type_only: bool = True) -> set[str]:
-    """Return what a module imports anywhere: own modules by their key, others by full name.
+# Modules named in a string: "pgdm.cli.worker", as after python -m or in import_module(...),
+# "pgdm.make:make_gym", or code such as "from pgdm.cli.main import main".
+_NAMED = re.compile(r"(pgdm(?:\.\w+)+)(?::\w+)?")
+_IN_CODE = re.compile(r"\b(?:from|import)\s+(pgdm(?:\.\w+)*)")
 
-    Imports inside functions count: they are dependencies as well. So do those under
-    ``TYPE_CHECKING``, unless ``type_only`` is false.
-    """
+
+def named_in_strings(tree: ast.AST) -> set[str]:
+    """Return the own modules that strings name, docstrings excepted, which are no dependencies."""
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     names: set[str] = set()
-    tree = ast.parse(sources[module])
-    for node in ast.walk(tree if type_only else _NoTypeOnly().visit(tree)):
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            if id(node) in docstrings:
+                continue
+            whole = _NAMED.fullmatch(node.value)
+            names |= {whole[1]} if whole else set(_IN_CODE.findall(node.value))
+    return names
+
+
+@cache
+def _statements(source: str, loaded: bool) -> tuple[set[str], set[tuple[str, str]]]:
+    """Return the modules that a source imports, and the pairs of ``from ... import ...``."""
+    tree = ast.parse(source)
+    pairs: set[tuple[str, str]] = set()
+    names = set() if loaded else named_in_strings(tree)
+    for node in ast.walk(_NoTypeOnly().visit(tree) if loaded else tree):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            assert not node.level, f"pgdm.{module} uses a relative import: spell it out"
-            origin = node.module or ""
-            for alias in node.names:
-                full = f"{origin}.{alias.name}"
-                names.add(full if full.removeprefix("pgdm.") in sources else origin)
+            assert not node.level, f"spell relative imports out: {ast.unparse(node)}"
+            pairs |= {(node.module or "", alias.name) for alias in node.names}
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            names |= named_in_strings(node)
+    return names, pairs
+
+
+def imported(module: str, sources: Sources, loaded: bool = False) -> set[str]:
+    """Return what a module depends on: own modules by their key, others by full name.
+
+    Imports inside functions count. So do imports under ``TYPE_CHECKING`` and modules that are
+    started as processes, unless ``loaded`` asks only for what is loaded with the module.
+    """
+    names, pairs = _statements(sources[module], loaded)
+    full = {f"{origin}.{name}": origin for origin, name in pairs}
+    names = names | {f if f.removeprefix("pgdm.") in sources else o for f, o in full.items()}
     own = {n.removeprefix("pgdm.") if n.split(".")[0] == "pgdm" else n for n in names}
     return own - {module}
 
 
-def room(module: str) -> str:
-    """Return a module's room: ``sim.batch`` lies in ``sim``."""
+def places(package: str, sources: Sources) -> set[str]:
+    """Return the modules that import a third-party package."""
+    return {
+        module
+        for module in sources
+        if any(name.split(".")[0] == package for name in imported(module, sources) - set(sources))
+    }
+
+
+def top_level(module: str) -> str:
+    """Return the part of pgdm that a module belongs to: ``sim`` for ``sim.batch``."""
     return module.split(".")[0]
 
 
-def floor(name: str) -> int:
-    """Return how high a room lies."""
-    return next(i for i, rooms in enumerate(FLOORS) if name in rooms)
+def layer(name: str) -> int:
+    """Return the layer of a package or module directly in pgdm, from 0."""
+    return next(i for i, names in enumerate(LAYERS) if name in names)
 
 
 def upward_imports(sources: Sources) -> list[str]:
-    """Return every import that goes up, sideways, or past what a narrow room may see."""
+    """Return every import that goes up, sideways, or past what ``NARROW`` allows."""
     wrong = []
     for module in sources:
-        here = room(module)
+        here = top_level(module)
         for target in sorted(imported(module, sources) & set(sources)):
-            there = room(target)
+            there = top_level(target)
             if there == here:
                 continue
-            below = floor(there) < floor(here)
+            below = layer(there) < layer(here)
             if not below or there not in NARROW.get(here, {there}):
                 wrong.append(f"{module} imports {target}")
     return wrong
@@ -129,21 +178,30 @@ def upward_imports(sources: Sources) -> list[str]:
 
 def stray_packages(sources: Sources) -> list[str]:
     """Return every import of a third-party package outside the places it is meant for."""
-    wrong = []
-    for module in sources:
-        for target in sorted(imported(module, sources) - set(sources)):
-            places = ALLOWED.get(target.split(".")[0])
-            if places is not None and not places & {module, room(module)}:
-                wrong.append(f"{module} imports {target}")
-    return wrong
+    return [
+        f"{module} imports {package}"
+        for package, allowed in ALLOWED.items()
+        for module in sorted(places(package, sources))
+        if not allowed & {module, top_level(module)}
+    ]
+
+
+def unused_permissions(sources: Sources) -> list[str]:
+    """Return every permission to import a third-party package that no module uses."""
+    return [
+        f"{allowed} does not import {package}"
+        for package, permitted in ALLOWED.items()
+        for allowed in sorted(permitted)
+        if not {allowed} & {n for m in places(package, sources) for n in (m, top_level(m))}
+    ]
 
 
 def cycle(sources: Sources) -> list[str]:
     """Return the modules of one import cycle, or nothing.
 
-    Two modules of one room may name each other's types; between rooms even that is upward.
+    Two modules of one package may name each other's types; between packages even that is upward.
     """
-    edges = {m: sorted(imported(m, sources, type_only=False) & set(sources)) for m in sources}
+    edges = {m: sorted(imported(m, sources, loaded=True) & set(sources)) for m in sources}
     finished: set[str] = set()
 
     def visit(module: str, path: list[str]) -> list[str]:
@@ -160,26 +218,38 @@ def cycle(sources: Sources) -> list[str]:
     return next((found for module in sources if (found := visit(module, []))), [])
 
 
-def test_every_room_has_a_floor() -> None:
-    known = set().union(*FLOORS)
-    unknown = {room(module) for module in read_sources()} - known
-    assert not unknown, f"give these rooms a floor here and in docs/architecture.md: {unknown}"
+def test_every_package_has_a_layer_and_exists() -> None:
+    names = {top_level(module) for module in read_sources()}
+    assert names == set().union(*LAYERS), "change LAYERS and the table in docs/architecture.md"
+    assert sum(map(len, LAYERS)) == len(names)
 
 
-def test_the_documentation_draws_the_same_floors() -> None:
+def test_the_documentation_has_the_same_tables() -> None:
     page = (REPOSITORY / "docs" / "architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d+) \| ([^|]+) \|", page, re.MULTILINE)
-    drawn = {name: int(row) for row, names in rows for name in re.findall(r"`(\w+)`", names)}
-    rooms = {room(module) for module in read_sources()}
-    assert drawn == {name: floor(name) + 1 for name in rooms}
+    drawn = [set(re.findall(r"`(\w+)`", names)) for _, names in rows]
+    assert [int(number) for number, _ in rows] == list(range(1, len(LAYERS) + 1))
+    assert drawn == LAYERS
+    _, _, packages = page.partition("| package | where |")
+    packages = packages.strip().split("\n\n")[0]
+    found: dict[str, set[str]] = {}
+    for names, where in re.findall(r"^\| (`[^|]+) \| ([^|]+) \|", packages, re.MULTILINE):
+        places = {place.removesuffix(".py").replace("/", ".") for place in _quoted(where)}
+        found |= dict.fromkeys(_quoted(names), places)
+    assert found == ALLOWED
+
+
+def _quoted(text: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", text)
 
 
 def test_imports_go_down_only() -> None:
     assert upward_imports(read_sources()) == []
 
 
-def test_packages_stay_where_they_are_meant_for() -> None:
+def test_packages_are_imported_where_they_may_be() -> None:
     assert stray_packages(read_sources()) == []
+    assert unused_permissions(read_sources()) == []
 
 
 def test_no_cycles() -> None:
@@ -195,11 +265,30 @@ def test_no_cycles() -> None:
         ("rl.extra", "from pgdm.sim.scene import Scene"),  # below, but rl is narrow
         ("sim.extra", "from pgdm import experiment"),
         ("sim.extra", "import pgdm"),
+        # by name
+        ("sweep.extra", "importlib.import_module('pgdm.cli.worker')"),
+        ("sweep.extra", "def f():\n    run([sys.executable, '-m', 'pgdm.cli.worker', *more])"),
+        ("sweep.extra", "CODE = 'import sys; from pgdm.cli.worker import main; sys.exit(main())'"),
+        ("sweep.extra", "code = f'import pgdm.cli.worker; {more}'"),
+        ("sim.extra", "register(entry_point='pgdm.envs.build:make')"),
+        ("sweep.extra", "if TYPE_CHECKING:\n    from pgdm.cli.worker import main"),
     ],
 )
 def test_a_violation_is_caught(module: str, source: str) -> None:
     base = {"envs.build": "", "sim.scene": "", "experiment": "", "seeding": "", "pgdm": ""}
-    assert upward_imports(base | {module: source}) != []
+    assert upward_imports(base | {"cli.worker": "", module: source}) != []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        '"""See ``pgdm.cli.worker``, and from pgdm.cli import nothing."""',
+        "raise Error('to train: python -m pgdm.cli.worker is not the command')",
+        "log = getLogger('pgdm')",
+    ],
+)
+def test_a_mention_is_no_import(source: str) -> None:
+    assert upward_imports({"pgdm": "", "cli.worker": "", "sweep.extra": source}) == []
 
 
 @pytest.mark.parametrize(
@@ -211,7 +300,9 @@ def test_a_violation_is_caught(module: str, source: str) -> None:
         ("envs.gym", "import torchrl", False),
         ("envs.torchrl", "from torchrl.envs import EnvBase", True),
         ("config.schema", "from omegaconf import MISSING", False),
-        ("config.store", "from hydra import compose", True),
+        ("config.compose", "from hydra import compose", True),
+        ("cli.jobs", "from hydra import compose", True),
+        ("cli.run", "from hydra import compose", False),
         ("cli.run", "import mlflow", False),
         ("mdp.extra", "import torch", True),
     ],
@@ -229,4 +320,6 @@ def test_a_cycle_is_caught() -> None:
     }
     assert cycle(sources) == ["sim.a", "sim.b", "sim.c", "sim.a"]
     assert cycle(sources | {"sim.c": ""}) == []
+    by_name = "def f():\n    return importlib.import_module('pgdm.sim.a')"
+    assert cycle(sources | {"sim.c": by_name}) != []
     assert cycle(sources | {"sim.c": "if TYPE_CHECKING:\n    import pgdm.sim.a"}) == []

@@ -1,11 +1,11 @@
-"""Comparing models: equal ones are equal, and each kind of change is found."""
+"""Comparing models: no difference between equal ones, and each kind of change is found."""
 
 from __future__ import annotations
 
 import mujoco
 import pytest
 
-from pgdm.library.compare import compare, compare_options
+from pgdm.library.checks.compare import compare, compare_options
 
 MODEL = """<mujoco><compiler angle="radian"/><option timestep="0.004"/><asset>
 <mesh name="m" vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1"/></asset><worldbody>
@@ -45,20 +45,21 @@ def test_a_model_equals_itself() -> None:
         ('<pair geom1="g" geom2="h" condim="1"/>', "", "pair g and h present: yes against no"),
     ],
 )
-def test_a_changed_figure_is_found_and_named(old: str, new: str, found: str) -> None:
+def test_a_changed_value_is_found_and_named(old: str, new: str, found: str) -> None:
     differences = compare(build(), build(old, new))
     assert any(str(d).startswith(found) for d in differences), [str(d) for d in differences]
     assert all(d.physical for d in differences)
 
 
 def test_gain_mass_and_mesh_are_found() -> None:
-    assert {d.figure for d in compare(build(), build('kp="5"', 'kp="6"'))} == {
+    assert {d.attribute for d in compare(build(), build('kp="5"', 'kp="6"'))} == {
         "gainprm",
         "biasprm",
     }
-    assert "mass" in {d.figure for d in compare(build(), build('".1 .2"', '".1 .2" density="5"'))}
+    denser = compare(build(), build('".1 .2"', '".1 .2" density="5"'))
+    assert "mass" in {d.attribute for d in denser}
     changed = compare(build(), build("0 0 .1", "0 0 .2"))
-    assert "mesh" in {d.figure for d in changed if d.element == "geom h"}
+    assert "mesh" in {d.attribute for d in changed if d.element == "geom h"}
 
 
 def test_what_only_shows_is_not_called_physical() -> None:

@@ -1,4 +1,4 @@
-"""Expert hand trajectories: files, alignment and contacts on numbers worked by hand."""
+"""Expert hand trajectories: files, alignment and contacts, with values computed by hand."""
 
 from __future__ import annotations
 
@@ -12,22 +12,16 @@ import torch
 
 from library_trees import make_checkout
 from pgdm.errors import CorruptAssetError, LibraryError, UnknownNameError
-from pgdm.library import (
-    Expert,
-    Motion,
-    ensure_expert,
-    expert_contacts,
-    expert_file,
-    expert_index,
-    import_tcdm,
-    open_library,
-    wheel_experts,
-)
-from pgdm.library.expert_hand import ExpertHand
-from pgdm.library.expert_index import ExpertEntry, ExpertIndex
-from pgdm.library.explain import explain_expert
+from pgdm.library import Expert, Motion, ensure_expert, import_tcdm, open_library
+from pgdm.library.checks.explain import explain_expert
+from pgdm.library.checks.verify import damaged
+from pgdm.library.experts import contacts as expert_contacts
+from pgdm.library.experts.kinematics import ExpertHand
+from pgdm.library.files import expert as expert_file
+from pgdm.library.files import expert_index
+from pgdm.library.files.expert_index import ExpertEntry, ExpertIndex
 from pgdm.library.manifest import FileEntry
-from pgdm.library.verify import damaged
+from pgdm.library.robohive import experts as wheel_experts
 from pgdm.motion.reference import ExpertReference
 
 STEPS, FRAMES = 6, 8
@@ -148,7 +142,7 @@ def test_a_constant_displacement_is_taken_out_of_the_task_known_for_it(
     monkeypatch.setitem(wheel_experts.STORED_POSES, "alarmclock-lift", STEPS)
     moved = recorded()["object_translation"] + (0.0007, -0.0101, -0.0029)
     path = write_recording(tmp_path, object_translation=moved)
-    with pytest.raises(CorruptAssetError, match=r"lies 10\.5 mm from the motion of hammer-use1"):
+    with pytest.raises(CorruptAssetError, match=r"of hammer-use1: its object is 10\.5 mm away"):
         wheel_experts.read(path, "hammer-use1", motion())
     path = write_recording(tmp_path, "alarmclock-lift", object_translation=moved)
     recording = wheel_experts.read(path, "alarmclock-lift", motion())
@@ -166,7 +160,7 @@ TURNED = np.tile([np.cos(0.05), np.sin(0.05), 0, 0], (FRAMES, 1))  # by 0.1 rad
         ({"human_joint_coords": np.zeros((FRAMES, 21, 3))}, "'human_joint_coords' has shape"),
         ({"human_obj_contact": np.full(FRAMES, 7)}, "'human_obj_contact' holds other values"),
         ({"object_orientation": np.ones((FRAMES, 4))}, "object_orientation row 0 has norm 2"),
-        ({"object_orientation": TURNED}, r"turned by up to 5\.7 degrees: not a recording"),
+        ({"object_orientation": TURNED}, r"rotated by up to 5\.7 degrees"),
         ({"s": np.array([{"a": print}], object)}, "builtins.print"),
     ],
 )
@@ -179,13 +173,13 @@ def test_a_bad_recording_is_refused_by_name(
     assert "Adroit_hammer_use_1.npz" in str(caught.value)
 
 
-def test_empty_and_short_recordings_are_told_apart(tmp_path: Path) -> None:
+def test_empty_and_short_recordings_have_different_errors(tmp_path: Path) -> None:
     short = {name: value[:5] for name, value in recorded().items()}
     path = write_recording(tmp_path, **short)
     with pytest.raises(CorruptAssetError, match="has 5 frames, fewer than the 6 poses"):
         wheel_experts.read(path, "hammer-use1", motion())
     path.write_bytes(b"")
-    with pytest.raises(CorruptAssetError, match=r"Adroit_hammer_use_1\.npz: is empty in the pack"):
+    with pytest.raises(CorruptAssetError, match=r"Adroit_hammer_use_1\.npz is empty in the pack"):
         wheel_experts.read(path, "hammer-use1", motion())
 
 
@@ -236,11 +230,11 @@ def test_distance_and_closest_point_of_a_finger(
     np.testing.assert_allclose(there.points, here.points, atol=1e-5)
 
 
-def test_contact_needs_closeness_and_the_recordings_word() -> None:
+def test_contact_needs_closeness_and_the_recordings_flag() -> None:
     distances = np.array([[0.0079, 0.0081, -0.01, 0.0, 0.1]] * 2)
     contacts = expert_contacts.Contacts(np.zeros((2, 5, 3)), distances)
-    made = contacts.made(np.array([True, False]))
-    assert made.tolist() == [[True, False, True, True, False], [False] * 5]
+    found = contacts.in_contact(np.array([True, False]))
+    assert found.tolist() == [[True, False, True, True, False], [False] * 5]
 
 
 def test_an_object_without_solid_parts_is_refused(tmp_path: Path) -> None:
@@ -248,7 +242,7 @@ def test_an_object_without_solid_parts_is_refused(tmp_path: Path) -> None:
     xml.write_text(
         BLOCK.replace('size="0.02 0.03 0.04"', 'size="1 1 1" contype="0" conaffinity="0"')
     )
-    with pytest.raises(CorruptAssetError, match="has no part that touches things"):
+    with pytest.raises(CorruptAssetError, match="has no collision geom"):
         expert_contacts.measure(xml, np.zeros((1, 3)), STILL[None], finger((1, 0, 0), (2, 0, 0)))
 
 
@@ -256,7 +250,7 @@ def test_an_object_without_solid_parts_is_refused(tmp_path: Path) -> None:
 
 
 def entry(**values: Any) -> ExpertEntry:
-    figures = {
+    values_of = {
         "file": FileEntry("0" * 64, 1, "tmp_data/Adroit_hammer_use_1.npz", "Apache-2.0"),
         "package": "robohive 0.4.0, SHA-256 00",
         "approximate": False,
@@ -271,7 +265,7 @@ def entry(**values: Any) -> ExpertEntry:
         "contact_frames": [5, 4, 3, 2, 1],
         "within_5mm": [1.0, 0.8, 0.6, 0.4, 0.2],
     }
-    return ExpertEntry(**(figures | values))
+    return ExpertEntry(**(values_of | values))
 
 
 @pytest.fixture
@@ -280,7 +274,7 @@ def root(tmp_path: Path) -> Path:
     import_tcdm(make_checkout(tmp_path / "TCDM", ("hammer_use1", "dmanus_cup")), root)
     file = root / "experts" / "hammer-use1.npz"
     expert_file.write(file, arrays())
-    reasons = {"cup-pour1": "Adroit_cup_pour_1.npz: is empty in the package"}
+    reasons = {"cup-pour1": "Adroit_cup_pour_1.npz is empty in the package"}
     expert_index.write(file.parent, ExpertIndex("2026", {"hammer-use1": entry()}, reasons))
     return root
 
@@ -295,7 +289,7 @@ def test_a_task_without_one_names_those_that_have_it_and_the_reason(root: Path) 
     library = open_library(root)
     with pytest.raises(UnknownNameError, match=r"unknown expert hand.*'dmanus-cup'.*hammer-use1"):
         library.expert("dmanus-cup")
-    with pytest.raises(UnknownNameError, match=r"Left out: Adroit_cup_pour_1\.npz: is empty"):
+    with pytest.raises(UnknownNameError, match=r"Left out: Adroit_cup_pour_1\.npz is empty"):
         library.expert("cup-pour1")
     with pytest.raises(UnknownNameError, match="with 'pgdm assets fetch'"):
         open_library(root / "nowhere").expert("hammer-use1")
@@ -308,7 +302,7 @@ def test_one_that_does_not_fit_the_motion_is_refused(root: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["{", '{"format": 99}', "[]", '{"format": 1, "experts": {}}'])
-def test_a_damaged_index_says_what_to_do(root: Path, text: str) -> None:
+def test_the_error_for_a_damaged_index_names_the_command_that_helps(root: Path, text: str) -> None:
     (root / "experts" / "manifest.json").write_text(text)
     with pytest.raises(CorruptAssetError, match=r"experts/manifest\.json.*'pgdm assets fetch'"):
         open_library(root).experts()
@@ -326,7 +320,7 @@ def test_its_quality_is_shown(root: Path) -> None:
         "(published): robohive 0.4.0, SHA-256 00",
         "Apache-2.0  from tmp_data/Adroit_hammer_use_1.npz",
         "poses: 6, after 14 frames of the recording",
-        "off the motion's by 1.200 mm (mean), 3.400 mm (most), after a shift by (0.0, -10.1, 0.0)",
+        "off the motion's by 1.200 mm (mean), 3.400 mm (max), after a shift by (0.0, -10.1, 0.0)",
         "limits by up to 0.86 rad and, at the base, 0.26 m",
         "touches the object at 5 poses, of which",
         "th in contact 1, within 5 mm 20%",
@@ -335,7 +329,7 @@ def test_its_quality_is_shown(root: Path) -> None:
     write_approximate(root)
     assert "(rebuilt, approximate)" in "\n".join(explain_expert(open_library(root), "hammer-use1"))
     for task, words in (
-        ("cup-pour1", "none, Adroit_cup_pour_1.npz: is empty"),
+        ("cup-pour1", "none, Adroit_cup_pour_1.npz is empty"),
         ("mug-drink3", "not fetched yet. Get"),
         ("door-open", "not from motion capture"),
     ):

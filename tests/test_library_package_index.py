@@ -1,4 +1,4 @@
-"""Getting a file through pip's configuration, and going on after a break."""
+"""Downloading a file through pip's configuration, and resuming a broken download."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from pgdm.errors import LibraryError
-from pgdm.library import package_index
-from pgdm.library.package_index import Package
-from pgdm.library.report import silent
+from pgdm.library.progress import silent
+from pgdm.library.robohive import package_index
+from pgdm.library.robohive.package_index import Package
 
 NAME, VERSION = "pgdm-test-data", "1.0"
 FILE = "pgdm_test_data-1.0-py3-none-any.whl"
@@ -190,7 +190,7 @@ def test_another_file_than_expected_is_refused(
 ) -> None:
     good = index.wheel.read_bytes()
     index.content = b"x" * len(good) if change == "other content" else good + b"x"
-    with pytest.raises(LibraryError, match="is not the file expected"):
+    with pytest.raises(LibraryError, match="is not the expected file"):
         received(package, index, tmp_path)
     assert list(tmp_path.glob(f"{FILE}*")) == []
 
@@ -207,7 +207,7 @@ def test_where_only_pip_has_the_password_pip_fetches(
     package: Package, index: type[Index], tmp_path: Path
 ) -> None:
     index.status = 403
-    # pip is refused as well here, which shows that it was asked.
+    # pip is refused as well here, which shows that it was called.
     with pytest.raises(LibraryError, match=r"pip cannot download .*403"):
         package_index.fetch(package, tmp_path, False, silent)
     assert len(index.ranges) == 2
@@ -246,7 +246,7 @@ def test_an_index_without_the_package_is_named(
         package_index.fetch(package, tmp_path, False, silent)
 
 
-def test_without_pip_the_message_says_so(
+def test_the_error_without_pip_names_the_remedies(
     package: Package, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A Python without pip: an isolated one that has nothing but its standard library.

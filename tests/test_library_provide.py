@@ -1,4 +1,4 @@
-"""A library that fills itself when a task is missing."""
+"""A library that is filled automatically when a task is missing."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pytest
 
 from library_trees import make_checkout
 from pgdm.errors import LibraryError, UnknownNameError
-from pgdm.library import ensure, figures, import_tcdm, names, open_library, provide, staging
-from pgdm.library.provide import Spoken
+from pgdm.library import ensure, import_tcdm, open_library, staging
+from pgdm.library.progress import ProgressLines
 
 
 def test_what_is_there_is_not_fetched(tmp_path: Path) -> None:
@@ -51,7 +51,7 @@ def test_a_task_that_only_a_checkout_has_is_not_fetched(tmp_path: Path) -> None:
         ensure("door-open", False, root=tmp_path / "library")
 
 
-def test_a_task_that_does_not_exist_is_told_from_a_missing_one(tmp_path: Path) -> None:
+def test_a_task_that_does_not_exist_is_an_unknown_name(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="unknown task 'hammer-use'; did you mean hammer-us"):
         ensure("hammer-use", False, root=tmp_path / "library")
 
@@ -73,22 +73,36 @@ def test_a_fetch_is_announced_with_size_and_licence(
     assert open_library(tmp_path / "library").tasks() == {}
 
 
-def test_the_two_sources_make_51_tasks() -> None:
-    every = [*figures.GRAB_TASKS, *figures.OTHER_TASKS]
-    assert len(figures.GRAB_TASKS) == 40
-    assert len(set(every)) == 51
-    assert all(names.hand_of(task) == "adroit" for task in figures.GRAB_TASKS)
-
-
-def test_progress_in_words_comes_now_and_then_with_an_estimate(
+def test_progress_lines_come_every_few_seconds_with_an_estimate(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = [100.0]
-    monkeypatch.setattr(provide.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
     said: list[str] = []
-    spoken = Spoken(said.append, interval_s=5.0)
+    lines = ProgressLines(said.append, interval_s=5.0)
     for second in range(11):
         now[0] = 100.0 + second
-        spoken("download", 10 * second, 200)
+        lines("download", 10 * second, 200)
     # 10 a second: at 5 s 50 of 200 are done and 150 left, at 10 s 100.
     assert said == ["download: 25%, 15 s left", "download: 50%, 10 s left"]
+
+
+def test_a_step_that_reports_nothing_more_is_repeated_until_it_is_done(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    said: list[str] = []
+    lines = ProgressLines(said.append, interval_s=5.0)
+    lines.repeat()
+    lines("compiling", 0, 1)
+    for second in (4, 6, 8, 11):
+        now[0] = 100.0 + second
+        lines.repeat()
+    assert said == ["compiling: 6 s", "compiling: 11 s"]
+    lines("compiling", 1, 1)
+    now[0] = 120.0
+    lines.repeat()
+    assert len(said) == 2
+    lines("drawing", 0, 10)  # steps that are short each still show something every few seconds
+    assert said[2:] == ["drawing"]

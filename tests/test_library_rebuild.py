@@ -1,4 +1,4 @@
-"""Rebuilding expert trajectories: its steps by hand-worked numbers, and the real recordings."""
+"""Rebuilding expert trajectories: each step with values computed by hand, and the recordings."""
 
 from __future__ import annotations
 
@@ -10,18 +10,16 @@ import pytest
 
 from conftest import fetched_wheel
 from pgdm.errors import CorruptAssetError
-from pgdm.library import (
-    human_hand,
-    myohand,
-    open_library,
-    rebuild,
-    registry,
-    wheel_experts,
-)
-from pgdm.library.human_hand import PalmView, Ridge
-from pgdm.library.limp_hand import LimpHand, PulledHand, bone_scaled
-from pgdm.library.myohand import MyoHand
-from pgdm.library.rebuild import Rebuilder
+from pgdm.library import open_library
+from pgdm.library.experts import human_hand, rebuild
+from pgdm.library.experts.human_hand import PalmView, Ridge
+from pgdm.library.experts.limp_hand import LimpHand, PulledHand, bone_scaled
+from pgdm.library.experts.rebuild import Rebuilder
+from pgdm.library.robohive import experts as wheel_experts
+from pgdm.library.robohive import fill as registry
+from pgdm.library.robohive import myohand
+from pgdm.library.robohive.myohand import MyoHand
+from pgdm.library.tasks import REBUILT_EXPERTS
 
 HALF = 0.5**0.5
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -53,7 +51,7 @@ def test_one_rigid_transform_brings_a_motion_onto_another() -> None:
     assert shift == pytest.approx([0.0, 0.0, 0.1])
 
 
-def test_half_a_frame_later_lies_between_and_goes_on_at_the_end() -> None:
+def test_half_a_frame_later_is_interpolated_and_extrapolated_at_the_end() -> None:
     values = np.array([[0.0], [2.0], [6.0]])
     assert human_hand.later(values, 0.5).tolist() == [[1.0], [4.0], [8.0]]
     assert human_hand.later(values, 0.0).tolist() == values.tolist()
@@ -147,7 +145,7 @@ def test_a_hand_without_a_point_is_refused(models: list[Path]) -> None:
 
 
 def _recordings(folder: Path) -> MyoHand:
-    """Write a MyoHand whose i-th point lies i cm along x of its palm, and a recording."""
+    """Write a MyoHand whose i-th point is i cm along x of its palm, and a recording."""
     bodies = "".join(
         f'<body name="{name}" pos="{0.01 * i} 0 0">{"<joint/>" * (2 if i < 9 else 1)}</body>'
         for i, name in enumerate(myohand._POINTS)
@@ -208,7 +206,7 @@ def folder() -> Iterator[Path]:
 def test_a_rebuilt_trajectory_is_near_the_published_one(folder: Path, library_home: Path) -> None:
     rebuilder = Rebuilder(open_library(), folder)
     assert len(rebuilder.tasks()) == 86
-    assert not set(rebuild.TASKS) & set(rebuilder.tasks())
+    assert not set(REBUILT_EXPERTS) & set(rebuilder.tasks())
     for task, human_mm, fingers_rad in (("spheremedium-lift", 4, 0.08), ("train-play1", 4, 0.12)):
         motion = open_library().motion(task)
         known = wheel_experts.read(rebuilder.published(task), task, motion)
@@ -224,7 +222,7 @@ def test_a_rebuilt_trajectory_is_near_the_published_one(folder: Path, library_ho
 @pytest.mark.slow
 def test_the_missing_four_follow_their_motions(folder: Path, library_home: Path) -> None:
     rebuilder = Rebuilder(open_library(), folder)
-    for task in rebuild.TASKS:
+    for task in REBUILT_EXPERTS:
         motion, made = open_library().motion(task), rebuilder.rebuild(task)
         assert made.approximate
         assert made.qpos.shape == (len(motion.translation), 30)

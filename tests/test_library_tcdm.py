@@ -17,7 +17,7 @@ import pytest
 from library_trees import STEPS, make_checkout, snapshot, trajectory, write_trajectory
 from pgdm.errors import CorruptAssetError, LibraryError, UnsafePickleError
 from pgdm.library import import_tcdm, manifest, open_library, staging
-from pgdm.library.check import compiled
+from pgdm.library.checks.compiled import compiled
 
 ROOT = os.environ.get("PGDM_TCDM_ROOT")
 TASKS = ("hammer_use1", "cup_pour1", "dhand_cup", "dmanus_cup")
@@ -171,7 +171,7 @@ DAMAGE: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "another hand's plan": (
         {"s_0": _start(actions=np.zeros((4, 9)))},
-        "start 'planned' has 9 actions a step, but adroit has 2 actuators",
+        "start 'planned' has 9 actions per step, but adroit has 2 actuators",
     ),
     "two poses a step": ({"DATA_SUBSTEPS": 2}, "DATA_SUBSTEPS is 2"),
     "half a substep": ({"SIM_SUBSTEPS": 0}, "substeps is 0"),
@@ -282,7 +282,7 @@ def test_a_checkout_without_any_complete_task_is_refused(checkout: Path, library
         import_tcdm(checkout, library)
 
 
-def test_a_poorer_checkout_does_not_replace_a_richer_one_unasked(
+def test_a_checkout_with_fewer_tasks_replaces_another_only_with_the_option(
     checkout: Path, library: Path
 ) -> None:
     import_tcdm(checkout, library)
@@ -360,6 +360,21 @@ def test_leftovers_of_a_killed_import_are_ignored_and_removed(
     assert sorted(p.name for p in library.iterdir()) == [".lock", "checkout"]
 
 
+def test_a_folder_two_levels_below_is_replaced_and_restored(library: Path) -> None:
+    with staging.locked(library):
+        with staging.replacing_folder(library, "objects/cup") as fresh:
+            (fresh / "a").write_bytes(b"1")
+        with pytest.raises(KeyError), staging.replacing_folder(library, "objects/cup") as fresh:
+            (fresh / "a").write_bytes(b"2")
+            raise KeyError
+        assert snapshot(library) == {"objects/cup/a": b"1"}
+        # Killed between the two renames: the next change restores the old content.
+        (library / "objects" / "cup").rename(library / "objects" / ".previous-cup")
+        with staging.replacing_folder(library, "objects/mug") as fresh:
+            (fresh / "a").write_bytes(b"3")
+        assert snapshot(library) == {"objects/cup/a": b"1", "objects/mug/a": b"3"}
+
+
 def _import_and_die(checkout: str, library: str, steps: int) -> None:
     seen = [0]
 
@@ -409,10 +424,10 @@ def test_a_full_disk_is_an_error_of_one_line_and_changes_nothing(
     assert snapshot(library) == before
 
 
-def test_the_lock_is_not_waited_for_endlessly(library: Path) -> None:
+def test_waiting_for_the_lock_times_out(library: Path) -> None:
     with (
         staging.locked(library),
-        pytest.raises(LibraryError, match=r"held the library's lock for 0 s"),
+        pytest.raises(LibraryError, match=r"has been changing the library for 0 s"),
         staging.locked(library, timeout_s=0.1),
     ):
         pass

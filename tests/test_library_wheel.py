@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from library_trees import snapshot
 from pgdm.errors import CorruptAssetError
-from pgdm.library import wheel
-from pgdm.library.report import silent
+from pgdm.library.progress import silent
+from pgdm.library.robohive import wheel
 
 
 def make(path: Path, members: dict[str, bytes]) -> Path:

@@ -1,8 +1,9 @@
-"""Terms, metrics, observations and actions against numbers worked by hand."""
+"""Terms, metrics, observations and actions against hand-computed numbers."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,12 @@ from pgdm.mdp.metrics import Episodes, MetricsCfg, episode_metrics
 from pgdm.mdp.observations import ObsCfg, layout, released
 from pgdm.sim.batch import SimState
 from tiny_scene import IDENTITY, QUARTER_Z, double, reference, tiny_index
+
+CFG = MetricsCfg(success_threshold_m=0.01, lift_height_m=0.02)
+ABSOLUTE = ActionCfg("absolute", 3, 0.25, "carried", 0, False)
+RESIDUAL = replace(ABSOLUTE, kind="residual")
+PLANNED = replace(RESIDUAL, wrist_path="planned")
+ZERO = torch.zeros(8).double()
 
 
 def state(pos: list, quat: list) -> SimState:
@@ -51,35 +58,32 @@ def test_tracking_reward_by_hand() -> None:
     assert rewards.tracking(c, 50.0, 0.1).item() == pytest.approx(math.exp(-4.0), rel=1e-9)
 
 
-def test_lift_needs_object_and_target() -> None:
+def test_the_lift_bonus_needs_object_and_target_above_the_height() -> None:
     up, down = [0.0, 0.0, 0.121], [0.0, 0.0, 0.119]
     c = context([up, up, down], [IDENTITY] * 3, [up, down, up], [IDENTITY] * 3)
     assert rewards.lift(c, 0.02).tolist() == [1.0, 0.0, 0.0]
 
 
-def test_object_is_lost_at_the_limit_exactly() -> None:
+def test_the_object_is_lost_exactly_at_the_limit() -> None:
     c = context([[0.25, 0, 0], [0.2499, 0, 0]], [IDENTITY] * 2, [[0.0, 0, 0]] * 2, [IDENTITY] * 2)
     assert terminations.object_lost(c, 0.25).tolist() == [True, False]
 
 
 @pytest.mark.parametrize(("t", "ended"), [(4, False), (5, True)])
-def test_motion_ends_at_its_last_pose(t: int, ended: bool) -> None:
+def test_the_motion_ends_at_its_last_pose(t: int, ended: bool) -> None:
     c = context([[0.0, 0, 0]], [IDENTITY], [[0.0, 0, 0]], [IDENTITY], t)
     assert terminations.motion_ended(c).item() is ended
 
 
-CFG = MetricsCfg(success_threshold_m=0.01, lift_height_m=0.02)
-
-
-def test_corrected_targets_are_those_of_the_centre_of_mass() -> None:
+def test_corrected_targets_are_positions_of_the_centre_of_mass() -> None:
     # The centre of mass lies 1 cm along the body's x; a quarter turn about z makes that world y.
     ref = reference([[1.0, 2.0, 3.0]] * 2, [IDENTITY, QUARTER_Z])
     corrected = ref.com_corrected(double([0.01, 0.0, 0.0]))
     torch.testing.assert_close(corrected.pos, double([[1.01, 2.0, 3.0], [1.0, 2.01, 3.0]]))
 
 
-def test_metrics_of_a_steady_two_millimetre_error() -> None:
-    # SPEC 1: over 85 steps the released error is 2e-3 sqrt(85) / 85 = 2.169e-4.
+def test_metrics_of_a_constant_error_of_two_millimetres() -> None:
+    # Over 85 steps the released error is 2e-3 sqrt(85) / 85 = 2.169e-4.
     ref = reference([[0.0, 0.0, 0.0]] * 86)
     pos = torch.zeros(1, 86, 3, dtype=torch.float64)
     pos[..., 0] = 0.002
@@ -92,8 +96,8 @@ def test_metrics_of_a_steady_two_millimetre_error() -> None:
     assert math.isnan(m["lifted"].item())  # nothing to lift
 
 
-def test_early_end_keeps_the_last_pose_but_earns_no_lift() -> None:
-    # Targets at 0, 3, 3, 3 cm; the object goes up at step 1 and the episode ends at step 2.
+def test_after_an_early_termination_the_last_pose_counts_but_not_as_lifted() -> None:
+    # Targets at 0, 3, 3, 3 cm; the object is lifted at step 1, and the episode stops at step 2.
     ref = reference([[0.0, 0, 0], [0.0, 0, 0.03], [0.0, 0, 0.03], [0.0, 0, 0.03]])
     pos = double([[[0.0, 0, 0], [0.0, 0, 0.025], [0.0, 0, 0.01], [9.0, 9, 9]]])
     quat = double([[IDENTITY] * 4])
@@ -105,7 +109,7 @@ def test_early_end_keeps_the_last_pose_but_earns_no_lift() -> None:
     assert m["length"].item() == 2.0
 
 
-def test_time_and_goals_of_the_observation() -> None:
+def test_released_observation_entry_by_entry() -> None:
     ref = reference([[float(k), 0.0, 0.0] for k in range(4)])
     index = tiny_index()
     observe = released(index, ref)
@@ -118,71 +122,60 @@ def test_time_and_goals_of_the_observation() -> None:
     np.testing.assert_allclose(obs.numpy(), expected, rtol=1e-6)
 
 
-def test_unknown_layout_and_kind_name_the_valid_ones() -> None:
+def test_unknown_layouts_and_kinds_are_errors_that_list_the_valid_ones() -> None:
     ref = reference([[0.0, 0, 0]] * 2)
     with pytest.raises(UnknownNameError, match="released"):
         layout(ObsCfg("relesed"), tiny_index(), ref)
     with pytest.raises(UnknownNameError, match="residual"):
-        action_map(
-            ActionCfg("residul", 3, 0.25, "carried", 0, False), tiny_index(), ref, torch.zeros(8)
-        )
+        action_map(replace(ABSOLUTE, kind="residul"), tiny_index(), ref, ZERO)
 
 
-def test_absolute_action_is_affine_and_clipped() -> None:
+def test_absolute_actions_are_affine_and_clipped() -> None:
     ref = reference([[0.0, 0, 0]] * 3)
-    amap = action_map(
-        ActionCfg("absolute", 3, 0.25, "carried", 0, False),
-        tiny_index(),
-        ref,
-        torch.zeros(8).double(),
-    )
+    amap = action_map(ABSOLUTE, tiny_index(), ref, ZERO)
     ctrl = amap.act(torch.tensor([[0.5, 0, 0, 0, 0, 0, 0.5, 9.0]]), torch.tensor([0]))[0]
     torch.testing.assert_close(ctrl, double([0.5, 0, 0, 0, 0, 0, 0.75, 2.0]))
 
 
-def test_warm_start_adds_a_fifth_to_the_second_joint_and_the_fingers() -> None:
+def test_warm_start_adds_0_2_to_the_second_joint_and_the_fingers() -> None:
     ref = reference([[0.0, 0, 0]] * 3)
     start = double([0.5, 0, 0, 1.0, 0, 0, 0.5, 1.9])
-    amap = action_map(ActionCfg("absolute", 3, 0.25, "carried", 0, False), tiny_index(), ref, start)
+    amap = action_map(ABSOLUTE, tiny_index(), ref, start)
     torch.testing.assert_close(amap.warm_start, double([0.5, 0.2, 0, 0.5, 0, 0, 0.2, 1.0]))
 
 
-def test_a_path_out_of_range_can_be_corrected_only_if_it_is_brought_into_it() -> None:
-    # Mount x runs to 1.5 where the control range ends at 1: the correction reaches 0.25 from 1.5
-    # or from 1.
+def test_only_a_clipped_path_leaves_room_for_corrections_at_the_limit() -> None:
+    # The path goes to 1.5 where the control range ends at 1: a correction of -0.25 starts at 1.5,
+    # or at 1 if clipped.
     ref = reference([[0.0, 0, 0], [0.0, 1.5, 0.0]])
     action, t = torch.tensor([[-1.0, 0, 0, 0, 0, 0, 0, 0]]), torch.tensor([1])
-    start = torch.zeros(8).double()
     for path, expected in (("carried", 1.0), ("clipped", 0.75)):
-        amap = action_map(ActionCfg("residual", 3, 0.25, path, 0, False), tiny_index(), ref, start)
+        amap = action_map(replace(RESIDUAL, wrist_path=path), tiny_index(), ref, ZERO)
         assert amap.act(action, t)[0, 0].item() == pytest.approx(expected)
 
 
-def test_residual_leads_by_three_steps_and_corrects_a_quarter() -> None:
+def test_residual_leads_by_three_steps_and_corrects_by_a_quarter() -> None:
     ref = reference([[0.0, 0.01 * k, 0.0] for k in range(10)])
-    cfg = ActionCfg("residual", 3, 0.25, "carried", 0, False)
-    amap = action_map(cfg, tiny_index(), ref, torch.zeros(8).double())
+    amap = action_map(RESIDUAL, tiny_index(), ref, ZERO)
     action = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0, 0], [0.0] * 8])
     ctrl = amap.act(action, torch.tensor([2, 8]))
     # Step 2: target of step 5 (world y 0.05 = mount x), plus 0.25 * 1 * half-range 1.
     assert ctrl[0, 0].item() == pytest.approx(0.05 + 0.25)
-    assert ctrl[1, 0].item() == pytest.approx(0.09)  # beyond the end: the last pose
+    assert ctrl[1, 0].item() == pytest.approx(0.09)  # beyond the motion: its last pose
     assert amap.warm_start[:6].abs().max() == 0.0
 
 
-def test_planned_commands_are_sent_as_they_are_and_corrected() -> None:
+def test_planned_commands_are_sent_unchanged_and_corrected() -> None:
     ref = reference([[0.0, 0.01 * k, 0.0] for k in range(4)])
     commands = double([[0.1 * k, 0, 0, 0, 0, 0] for k in range(1, 4)])
-    cfg, start = ActionCfg("residual", 3, 0.25, "planned", 0, False), torch.zeros(8).double()
-    amap = action_map(cfg, tiny_index(), ref, start, commands)
+    amap = action_map(PLANNED, tiny_index(), ref, ZERO, commands)
     action = torch.tensor([[0.0] * 8, [0.0] * 8, [1.0, 0, 0, 0, 0, 0, 0, 0]])
     ctrl = amap.act(action, torch.tensor([0, 2, 3]))
-    # No step ahead; after the last command it stays; corrected by a quarter of the half range.
+    # No lead; the last command is repeated; corrected by a quarter of the half-range.
     assert ctrl[:, 0].tolist() == pytest.approx([0.1, 0.3, 0.3 + 0.25])
 
 
-def test_a_planned_wrist_without_commands_is_refused() -> None:
-    cfg = ActionCfg("residual", 3, 0.25, "planned", 3, True)
+def test_a_planned_wrist_without_commands_is_an_error() -> None:
     ref = reference([[0.0, 0, 0], [0.1, 0, 0]])
     with pytest.raises(ConfigError, match="commands of a plan"):
-        action_map(cfg, tiny_index(), ref, torch.zeros(8).double())
+        action_map(PLANNED, tiny_index(), ref, ZERO)

@@ -1,9 +1,10 @@
-"""Terms that compare the hand with an expert's, against numbers worked by hand."""
+"""Terms that compare the hand with an expert's, against hand-computed numbers."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,34 +18,14 @@ from pgdm.mdp.measures import contact_distance, finger_joint_error, fingertip_er
 from pgdm.mdp.schedules import Ramp
 from pgdm.motion.reference import ExpertReference
 from pgdm.sim.batch import SimState
-from pgdm.sim.scene import SceneIndex
+from tiny_scene import QUARTER_Z, double, tiny_index
 
-QUARTER_Z = [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
-
-
-def double(values: object) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
-INDEX = SceneIndex(
-    point_geoms=np.array([0, 1, 2]),
-    point_bodies=np.array([0, 1, 2]),
-    object_body=3,
-    fingertips=np.array([2, 1]),  # two fingers, the last point first
-    num_actuators=4,
-    num_compensated=4,
-    num_base_joints=1,
-    ctrl_low=-np.ones(4),
-    ctrl_high=np.ones(4),
-    mount_pos=np.zeros(3),
-    mount_quat=np.array([1.0, 0, 0, 0]),
-    randomized_geom=None,
-)
-
+# Two fingers, the last point first; one base joint, a slide, and three finger joints.
+INDEX = replace(tiny_index(), fingertips=np.array([2, 1]), num_joints=4, num_base_joints=1)
 EXPERT = ExpertReference(
     joints=double([[0.0, 0, 0, 0], [0.1, 0.2, 0.3, 0.4], [0.0, 0, 0, 0]]),
     fingertips=double([[[0.0, 0, 0]] * 2, [[0.1, 0, 0], [0, 0.2, 0]], [[0.0, 0, 0]] * 2]),
-    # From the centre of mass along the body's axes: 1 cm along x, 2 cm along y.
+    # Relative to the centre of mass in the body's frame: 1 cm along x, 2 cm along y.
     contacts=double([[[9.0, 9, 9]] * 2, [[0.01, 0, 0], [0, 0.02, 0]], [[9.0, 9, 9]] * 2]),
     in_contact=torch.tensor([[False, False], [True, True], [True, False]]),
 )
@@ -52,9 +33,9 @@ EXPERT = ExpertReference(
 
 def context(t: int = 1, expert: ExpertReference | None = EXPERT) -> StepContext:
     """One simulation: fingertips at (0.1, 0, 0.03) and (0.04, 0.2, 0); the object at (0, 0.3, 0),
-    turned a quarter about z."""
+    rotated by 90 degrees about z."""
     state = SimState(
-        qpos=double([[0.4, 0.2, 0.0, 0.4, 7.0]]),  # the last is the object's
+        qpos=double([[0.4, 0.2, 0.0, 0.4, 7.0]]),  # the last entry is the object's
         qvel=double([[0.0] * 5]),
         point_pos=double([[[5.0, 5, 5], [0.04, 0.2, 0.0], [0.1, 0.0, 0.03]]]),
         point_quat=double([[[1.0, 0, 0, 0]] * 3]),
@@ -71,7 +52,7 @@ def context(t: int = 1, expert: ExpertReference | None = EXPERT) -> StepContext:
 @pytest.mark.parametrize(
     ("space", "form", "error"),
     [
-        # Tips are off by (0, 0, 0.03) and (0.04, 0, 0): as one vector 0.05 long.
+        # Fingertips are off by (0, 0, 0.03) and (0.04, 0, 0): as one vector, by 0.05.
         ("fingertips", "norm", 0.05),
         ("fingertips", "squared", 0.0025),
         # Joints are off by 0.3 m of slide and 0.3 rad of the second hinge.
@@ -79,7 +60,7 @@ def context(t: int = 1, expert: ExpertReference | None = EXPERT) -> StepContext:
         ("joints", "norm", math.sqrt(0.18)),
     ],
 )
-def test_hand_error_and_what_follows_from_it(space: str, form: str, error: float) -> None:
+def test_hand_error_with_its_reward_and_termination(space: str, form: str, error: float) -> None:
     c = context()
     assert c.hand_error(space, form).item() == pytest.approx(error)
     reward = rewards.hand_imitation(c, space, form, 15.0)
@@ -92,13 +73,13 @@ def test_hand_error_and_what_follows_from_it(space: str, form: str, error: float
 
 
 @pytest.mark.parametrize(("grace", "lost"), [(0, True), (1, False), (2, False)])
-def test_the_hand_is_not_lost_in_the_first_steps(grace: int, lost: bool) -> None:
-    c = context(t=1)  # the first step's state has t = 1
+def test_the_hand_is_never_lost_in_the_grace_steps(grace: int, lost: bool) -> None:
+    c = context(t=1)  # the state after the first step has t = 1
     flag = terminations.hand_lost(c, "fingertips", "norm", 0.01, grace_steps=grace)
     assert flag.tolist() == [lost]
 
 
-def test_contact_points_go_with_the_object() -> None:
+def test_contact_points_move_with_the_object() -> None:
     # A quarter turn about z takes the body's x to the world's y and its y to -x.
     points = context().contact_points
     torch.testing.assert_close(points, double([[[0.0, 0.31, 0.0], [-0.02, 0.3, 0.0]]]))
@@ -108,7 +89,7 @@ FIRST = math.sqrt(0.1**2 + 0.31**2 + 0.03**2)
 SECOND = math.sqrt(0.06**2 + 0.1**2)
 
 
-def test_contact_reward_is_the_mean_over_fingers() -> None:
+def test_the_contact_reward_is_the_mean_over_the_fingers() -> None:
     c = context()
     norm = 0.5 * (math.exp(-15 * FIRST) + math.exp(-15 * SECOND))
     squared = 0.5 * (math.exp(-15 * FIRST**2) + math.exp(-15 * SECOND**2))
@@ -118,7 +99,7 @@ def test_contact_reward_is_the_mean_over_fingers() -> None:
 
 
 def test_only_fingers_in_contact_count() -> None:
-    # At step 2 the first finger alone, at (9, 9, 9) of the body: (-9, 9.3, 9) in the world.
+    # At step 2 only the first finger, at (9, 9, 9) in the body's frame: (-9, 9.3, 9) in the world.
     distance = math.sqrt(9.1**2 + 9.3**2 + 8.97**2)
     c = context(t=2)
     expected = math.exp(-0.1 * distance)
@@ -126,7 +107,7 @@ def test_only_fingers_in_contact_count() -> None:
     assert contact_distance(c).item() == pytest.approx(distance)
 
 
-def test_nothing_is_asked_or_paid_where_the_expert_touches_nothing() -> None:
+def test_without_expert_contact_the_reward_is_zero_and_the_distance_nan() -> None:
     c = context(t=0)
     assert rewards.fingertip_contact(c, "squared", 15.0).item() == 0.0
     assert math.isnan(contact_distance(c).item())
@@ -139,7 +120,9 @@ def test_errors_in_plain_units() -> None:
 
 
 @pytest.mark.parametrize("term", [fingertip_error, finger_joint_error, contact_distance])
-def test_a_recipe_that_forgot_its_expert_is_told(term: Callable[[StepContext], Tensor]) -> None:
+def test_a_recipe_that_does_not_declare_its_expert_is_an_error(
+    term: Callable[[StepContext], Tensor],
+) -> None:
     with pytest.raises(ConfigError, match="needs_expert=True"):
         term(context(expert=None))
 
@@ -147,5 +130,5 @@ def test_a_recipe_that_forgot_its_expert_is_told(term: Callable[[StepContext], T
 @pytest.mark.parametrize(
     ("frames", "weight"), [(0, 0.0), (1_000_000, 2.5), (4_000_000, 10.0), (50_000_000, 10.0)]
 )
-def test_the_ramp_is_a_line_and_then_level(frames: int, weight: float) -> None:
+def test_the_ramp_is_linear_and_then_constant(frames: int, weight: float) -> None:
     assert Ramp("tracking", 10.0, 4_000_000)(frames) == {"tracking": weight}

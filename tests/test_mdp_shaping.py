@@ -1,4 +1,4 @@
-"""What a training adds to reward and ends, and that an evaluation has none of it."""
+"""Additions to the reward and the discount in training, and their absence in evaluations."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import pytest
 import torch
 
 from command_line import TINY, command
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.errors import ConfigError
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
 from pgdm.mdp.shaping import SLOPE, ShapingCfg
-from pgdm.tracking.run_folder import read_json
+from pgdm.runs.files import read_json
 
 SETTINGS = ("task=hammer-use1", "shaping=soft_end", "shaping.soft_end_m=0.1")
 KERNEL = ("shaping.kernel_weight=5", "shaping.kernel_scale=10")
-STILL = ShapingCfg("none", 0.0, 10.0, None)
+NO_SHAPING = ShapingCfg("none", 0.0, 10.0, None)
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_training_has_the_slope_and_the_soft_end_and_an_evaluation_has_neither() -> None:
+def test_training_has_slope_and_soft_end_and_evaluation_has_neither() -> None:
     builder = env_builder(compose([*SETTINGS, *KERNEL]), open_library())
     train, evaluation = builder.make(2, 1), builder.make(2, 1, stream="eval")
     own_sum = added_sum = torch.zeros(2).double()
@@ -39,27 +39,29 @@ def test_a_training_has_the_slope_and_the_soft_end_and_an_evaluation_has_neither
         if terminated.any():
             break
     trained, measured = info["episodes"].metrics(), plain["episodes"].metrics()
-    torch.testing.assert_close(trained["return"], measured["return"])  # the task's own
+    torch.testing.assert_close(
+        trained["return"], measured["return"]
+    )  # the return of the task alone
     torch.testing.assert_close(trained["shaping"], added_sum)
     assert "shaping" not in measured
 
 
 @pytest.mark.usefixtures("library_home")
-def test_without_shaping_a_training_is_as_an_evaluation() -> None:
+def test_without_shaping_training_uses_the_recipe_of_evaluation() -> None:
     builder = env_builder(compose(["task=hammer-use1"]), open_library())
     assert builder.make(1, 1).mdp.recipe is builder.mdp.recipe
 
 
-def test_what_is_added_is_said() -> None:
-    assert STILL.described() == ""
-    told = replace(STILL, kernel_weight=5.0, soft_end_m=0.15).described()
-    assert told == (
-        "with the object at distance e from its target, 5 exp(-e/0.1 m) is added to the reward and "
+def test_the_additions_are_described_in_words() -> None:
+    assert NO_SHAPING.described() == ""
+    described = replace(NO_SHAPING, kernel_weight=5.0, soft_end_m=0.15).described()
+    assert described == (
+        "with the object error e, 5 exp(-e/0.1 m) is added to the reward and "
         "future rewards are scaled by exp(-(e/0.15 m)^2)"
     )
 
 
-def test_a_dry_run_has_rows_for_what_is_added(library_home: Path) -> None:
+def test_a_dry_run_lists_the_additions(library_home: Path) -> None:
     outcome = command("pgdm-run", "--offline", *SETTINGS, *KERNEL, "--dry-run")
     rows = [line.split() for line in outcome.out.splitlines()]
     assert ["reward,", "training", "only", "slope", "5"] in rows
@@ -69,13 +71,13 @@ def test_a_dry_run_has_rows_for_what_is_added(library_home: Path) -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_result_says_what_was_added_and_nothing_if_nothing_was(tmp_path: Path) -> None:
+def test_a_result_records_the_additions_only_if_there_are_any(tmp_path: Path) -> None:
     for name, settings in (("bare", ()), ("shaped", KERNEL)):
         outcome = command("pgdm-run", "--offline", *TINY, *settings, f"run_dir={name}")
         assert outcome.code == 0, outcome.err
     assert "shaping" not in read_json(tmp_path / "bare" / "result.json")
-    told = read_json(tmp_path / "shaped" / "result.json")["shaping"]
-    assert told.endswith("5 exp(-e/0.1 m) is added to the reward")
+    recorded = read_json(tmp_path / "shaped" / "result.json")["shaping"]
+    assert recorded.endswith("5 exp(-e/0.1 m) is added to the reward")
 
 
 @pytest.mark.parametrize(
@@ -86,6 +88,6 @@ def test_a_result_says_what_was_added_and_nothing_if_nothing_was(tmp_path: Path)
         ({"soft_end_m": -0.1}, "soft_end_m is -0.1; it must be above 0"),
     ],
 )
-def test_wrong_numbers_are_named(changed: dict[str, float], message: str) -> None:
+def test_invalid_numbers_are_named(changed: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        replace(STILL, **changed).validate()
+        replace(NO_SHAPING, **changed).validate()

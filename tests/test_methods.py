@@ -1,4 +1,4 @@
-"""Each method in its real environment: what it adds, what it needs, and what it records."""
+"""Each method in its real environment: the terms it adds, the data it needs, what it records."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ import torch
 from torch import Tensor
 
 from command_line import TINY, command, process
+from pgdm.config.compose import compose
 from pgdm.config.groups import available
 from pgdm.config.identity import default_run_dir, identity, identity_hash
 from pgdm.config.saved import load_config, save_config
-from pgdm.config.store import compose
 from pgdm.envs.batch_env import BatchEnv
 from pgdm.envs.build import EnvBuilder
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.experiment import env_builder
 from pgdm.library import Expert, Library, open_library
-from pgdm.library.expert_hand import ExpertHand
+from pgdm.library.experts.kinematics import ExpertHand
 from pgdm.mdp.context import SPACES
 from pgdm.mdp.measures import HAND_MEASURES
 from pgdm.mdp.recipe import Measure
 from pgdm.methods import METHODS, pgdm, recipe
-from pgdm.tracking.run_log import RunLog
+from pgdm.runs.log import RunLog
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PGDM = {"tracking", "lift"}
@@ -43,10 +43,10 @@ ADDED = {
 
 
 class MadeUp(Library):
-    """The library, in which a task's expert keeps the hand where the task's start has it."""
+    """A library whose only expert, for cup-pour1, holds the hand still in its start state."""
 
     def expert(self, task: str) -> Expert:
-        """Return it; only one task has one."""
+        """Return the expert."""
         if task != "cup-pour1":
             raise UnknownNameError("expert hand trajectory", task, ["cup-pour1"])
         motion = self.motion(task)
@@ -77,12 +77,12 @@ def steps(env: BatchEnv, count: int) -> dict:
     return info
 
 
-def test_every_method_has_its_file_of_settings() -> None:
+def test_every_method_has_a_settings_file() -> None:
     assert set(available("method")) == set(METHODS)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_settings_have_their_own_class_and_survive_saving(method: str, tmp_path: Path) -> None:
+def test_settings_have_their_own_class_and_load_as_saved(method: str, tmp_path: Path) -> None:
     cfg = compose([f"method={method}", f"run_dir={tmp_path / 'run'}"])
     assert type(cfg.method) is METHODS[method].config
     assert {term.name for term in recipe(cfg.method).rewards} == PGDM | ADDED[method]
@@ -90,7 +90,7 @@ def test_settings_have_their_own_class_and_survive_saving(method: str, tmp_path:
     assert load_config(tmp_path / "run") == cfg
 
 
-def test_settings_of_a_method_tell_runs_apart() -> None:
+def test_settings_of_a_method_distinguish_runs() -> None:
     plain = compose(["method=deepmimic"])
     joints = compose(["method=deepmimic", "method.imitation.space=joints"])
     assert identity_hash(plain) != identity_hash(joints)
@@ -100,7 +100,7 @@ def test_settings_of_a_method_tell_runs_apart() -> None:
 
 
 @pytest.mark.parametrize("left_out", ["imitation", "contact", "curriculum"])
-def test_full_leaves_out_what_is_null(left_out: str) -> None:
+def test_full_leaves_out_sections_that_are_null(left_out: str) -> None:
     made = recipe(compose(["method=full", f"method.{left_out}=null"]).method)
     names = {term.name for term in made.rewards}
     assert names == PGDM | ({"imitation", "contact"} - {left_out})
@@ -108,36 +108,36 @@ def test_full_leaves_out_what_is_null(left_out: str) -> None:
     assert ("hand_lost" in {end.name for end in made.ends}) is (left_out != "imitation")
 
 
-def test_without_expert_terms_none_is_asked_for() -> None:
+def test_without_expert_terms_no_expert_is_needed() -> None:
     cfg = compose(["method=full", "method.imitation=null", "method.contact=null"])
     assert recipe(cfg.method).needs_expert is False
     assert recipe(cfg.method).measures == ()
 
 
-def test_the_table_names_all_that_is_active() -> None:
+def test_the_table_lists_all_active_terms() -> None:
     assert recipe(compose(["method=full"]).method).table() == [
         ("reward", "tracking", "10, scheduled from 0"),
         ("reward", "lift", "2.5"),
         ("reward", "imitation", "1"),
         ("reward", "contact", "1"),
-        ("end", "object_lost", ""),
-        ("end", "motion_ended", ""),
-        ("end", "hand_lost", ""),
+        ("termination", "object_lost", ""),
+        ("termination", "motion_ended", ""),
+        ("termination", "hand_lost", ""),
         ("measure", "hand_error_m", ""),
         ("measure", "hand_error_rad", ""),
         ("measure", "contact_distance_m", ""),
     ]
 
 
-def test_a_schedule_that_outlasts_a_run_is_told(library_home: Path) -> None:
+def test_a_schedule_that_outlasts_a_run_is_reported(library_home: Path) -> None:
     curriculum = recipe(compose(["method=curriculum"]).method)
     assert curriculum.unfinished(1_000_000) == [("tracking", 2.5, 10.0)]
     assert curriculum.unfinished(4_000_000) == []
     line = ["task=cup-pour1", "method=curriculum", "total_frames=1000000", "--dry-run"]
-    assert "weight of 'tracking' only comes to 2.5 of 10" in command("pgdm-run", *line).out
+    assert "weight of 'tracking' reaches only 2.5 of 10" in command("pgdm-run", *line).out
 
 
-def test_a_dry_run_of_one_run_shows_its_terms(tmp_path: Path) -> None:
+def test_a_dry_run_shows_the_terms_of_a_run(tmp_path: Path) -> None:
     outcome = command("pgdm-run", "task=cup-pour1", "method=curriculum", "--dry-run")
     assert outcome.code == 0
     assert re.search(r"reward +tracking +10, scheduled from 0", outcome.out)
@@ -147,18 +147,20 @@ def test_a_dry_run_of_one_run_shows_its_terms(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_dry_run_says_which_start_is_missing() -> None:
+def test_a_dry_run_names_the_missing_start() -> None:
     outcome = command("pgdm-run", "task=cup-pour1", "pregrasp=teleop", "--dry-run")
     assert outcome.code == 2 and "has no stored start 'teleop'" in outcome.errors[0]
-    assert command("pgdm-run", "task=cup-pour1", "pregrasp=mocap", "--dry-run").code == 0  # is made
-    assert command("pgdm-run", "task=cup-pour1", "method=graff", "--dry-run").code == 0  # fetched
+    assert (
+        command("pgdm-run", "task=cup-pour1", "pregrasp=mocap", "--dry-run").code == 0
+    )  # is computed
+    assert (
+        command("pgdm-run", "task=cup-pour1", "method=graff", "--dry-run").code == 0
+    )  # is fetched
 
 
 @pytest.mark.parametrize("pregrasp", ["planned", "mined", "none"])
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_plays_from_every_start(
-    method: str, pregrasp: str, library_home: Path
-) -> None:
+def test_every_method_runs_from_every_start(method: str, pregrasp: str, library_home: Path) -> None:
     builder = build(f"method={method}", f"pregrasp={pregrasp}")
     env = builder.make(2, 1)
     info = steps(env, 3)
@@ -171,7 +173,7 @@ def test_every_method_plays_from_every_start(
     assert any("approximate" in note for note in builder.notes) is expert
 
 
-def test_the_expert_is_clipped_and_its_contacts_are_seen_from_the_centre_of_mass(
+def test_the_expert_is_clipped_and_its_contacts_are_relative_to_the_centre_of_mass(
     library_home: Path,
 ) -> None:
     builder = build("method=graff")
@@ -182,12 +184,12 @@ def test_the_expert_is_clipped_and_its_contacts_are_seen_from_the_centre_of_mass
     env = builder.make(1, 1)
     steps(env, 3)
     context = env._context(env.sim.read())
-    # The made-up contact points are the origin of the object's body, wherever it lies.
+    # The made-up contact points are the origin of the object's body.
     origin = torch.from_numpy(env.sim.data(0).xpos[index.object_body].copy())
     torch.testing.assert_close(context.contact_points[0], origin.expand(5, 3))
 
 
-def test_measures_of_ones_own_stay_beside_those_of_the_expert() -> None:
+def test_own_measures_are_kept_next_to_those_of_the_expert() -> None:
     own = Measure("height_m", lambda step: step.start_height)
     base = replace(pgdm.recipe(compose(["task=hammer-use1"]).method), measures=(own,))
     made = base.comparing(HAND_MEASURES).comparing(HAND_MEASURES)
@@ -195,7 +197,7 @@ def test_measures_of_ones_own_stay_beside_those_of_the_expert() -> None:
     assert made.needs_expert and not base.needs_expert
 
 
-def test_measures_of_an_episode_are_means_over_the_steps_they_apply_to(library_home: Path) -> None:
+def test_measures_of_an_episode_are_means_over_the_applicable_steps(library_home: Path) -> None:
     env = build("method=graff").make(1, 1)
     seen: dict[str, list[Tensor]] = {}
     ended = None
@@ -207,14 +209,16 @@ def test_measures_of_an_episode_are_means_over_the_steps_they_apply_to(library_h
     episode = ended.metrics()
     for name, values in seen.items():
         torch.testing.assert_close(episode[name], torch.cat(values).nanmean()[None])
-    assert math.isnan(seen["contact_distance_m"][1].item())  # step 2: nothing is touched yet
+    assert math.isnan(seen["contact_distance_m"][1].item())  # step 2: no contact yet
     assert not math.isnan(seen["contact_distance_m"][2].item())
-    again = steps(env, 1)  # and the next episode begins from nothing
-    torch.testing.assert_close(env._measured[0, 0], again["measures"]["hand_error_m"])
+    again = steps(env, 1)  # the next episode starts with empty sums
+    torch.testing.assert_close(env._episodes._measured[0, 0], again["measures"]["hand_error_m"])
 
 
-def test_the_hand_ends_an_episode_after_its_grace_and_is_counted(library_home: Path) -> None:
-    # The made-up fingertips are far above the table: lost as soon as that is looked at.
+def test_a_lost_hand_terminates_an_episode_after_the_grace_steps_and_is_counted(
+    library_home: Path,
+) -> None:
+    # The made-up fingertips are far above the table: lost at the first check.
     env = build("method=deepmimic", "method.imitation.grace_steps=4").make(2, 1)
     assert not any(steps(env, 1)["ends"]["hand_lost"].any() for _ in range(4))
     info = steps(env, 1)
@@ -225,7 +229,7 @@ def test_the_hand_ends_an_episode_after_its_grace_and_is_counted(library_home: P
     assert "raw/imitation" in episodes and "term/imitation" in episodes
 
 
-def test_states_go_on_to_the_bit(library_home: Path) -> None:
+def test_restored_states_continue_bit_exactly(library_home: Path) -> None:
     builder = build("method=full")
     one, other = builder.make(2, 1), builder.make(2, 1)
     steps(one, 7)
@@ -238,8 +242,8 @@ def test_states_go_on_to_the_bit(library_home: Path) -> None:
         assert torch.equal(value.nan_to_num(), again[name].nan_to_num())
 
 
-def test_a_task_or_hand_without_expert_is_told_who_has_one() -> None:
-    """Before anything is fetched, made or started."""
+def test_a_task_or_hand_without_expert_is_an_error_that_names_those_with_one() -> None:
+    """The error comes before anything is fetched, computed or started."""
     with pytest.raises(
         ConfigError, match=r"none for .*'door-open'.* adroit40.*cup-pour1.* pgdm, c"
     ):
@@ -254,14 +258,14 @@ def test_a_task_or_hand_without_expert_is_told_who_has_one() -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_an_expert_that_is_missing_from_the_library_is_told_at_once() -> None:
+def test_an_expert_missing_from_the_library_is_an_error_at_construction() -> None:
     with pytest.raises(UnknownNameError, match=r"'duck-lift'.*cup-pour1"):
         build("task=duck-lift", "method=deepmimic")
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("expert_home")
-def test_the_experts_hand_is_lost_where_the_page_on_deepmimic_says() -> None:
+def test_the_experts_hand_is_lost_where_the_deepmimic_page_states() -> None:
     library = open_library()
     kinematics = ExpertHand(library.hand_xml("adroit"))
     starts, at_rest, recorded = [], 0, {}
@@ -276,7 +280,7 @@ def test_the_experts_hand_is_lost_where_the_page_on_deepmimic_says() -> None:
         starts.append(env._context(state).hand_error("fingertips", "squared").item())
         env._t[:] = 11
         at_rest += int(lost.reached(env._context(state)))
-        # An expert's own fingertips as recorded, not clipped, in the robot's place.
+        # The expert's own fingertips, as recorded and not clipped, instead of the robot's.
         expert = library.expert(task)
         offset = (
             torch.from_numpy(kinematics.fingertips(expert.qpos)) - builder.mdp.expert.fingertips
@@ -299,7 +303,7 @@ def test_the_experts_hand_is_lost_where_the_page_on_deepmimic_says() -> None:
 @pytest.mark.usefixtures("expert_home")
 @pytest.mark.parametrize("task", ["hammer-use1", "elephant-pass1"])
 def test_a_hand_at_the_experts_joints_is_where_the_expert_is(task: str) -> None:
-    """Real expert and real scene: finger by finger, row by row, and told where it is clipped."""
+    """Real expert and real scene, for each finger and several rows; clipping is reported."""
     builder = env_builder(compose([f"task={task}", "method=graff"]), open_library())
     expert, env = builder.mdp.expert, builder.make(1, 1)
     assert expert is not None
@@ -315,19 +319,19 @@ def test_a_hand_at_the_experts_joints_is_where_the_expert_is(task: str) -> None:
     assert far is (task == "elephant-pass1")
 
 
-def test_a_curriculum_is_recorded_and_does_not_act_on_evaluations(library_home: Path) -> None:
+def test_a_curriculum_is_recorded_and_does_not_affect_evaluations(library_home: Path) -> None:
     outcome = command(
         "pgdm-run", *TINY, "task=cup-pour1", "method=curriculum", "run_dir=run", "--offline",
         "method.curriculum.ramp_frames=32",
     )  # fmt: skip
     assert outcome.code == 0, outcome.err
-    assert "rewards tracking 10, scheduled from 0, lift 2.5; ends object_lost" in outcome.err
+    assert "rewards tracking 10, scheduled from 0, lift 2.5; terminations" in outcome.err
     assert "cup-pour1: method curriculum, hand adroit, pregrasp planned, " in outcome.err
     lines = RunLog(Path("run/metrics.jsonl")).read()
     trained = [line for line in lines if line["kind"] == "train"]
     assert [line["train/weight/tracking"] for line in trained] == [0.0, 5.0]
     evaluated = [line for line in lines if line["kind"] == "eval"]
-    assert len(evaluated) > 1  # the last one comes when the training's weight is 5
+    assert len(evaluated) > 1  # the training weight is 5 at the last one
     for line in evaluated:
         whole = 10 * float(line["eval_sampled/raw/tracking"])
         assert float(line["eval_sampled/term/tracking"]) == pytest.approx(whole)
@@ -352,12 +356,12 @@ OWN = Method(MethodCfg, recipe)
     ("top", "name", "value", "said"),
     [
         ("", "mine", "c.object_eror", "mine_method.py, line 9; --debug shows"),
-        ("", "mine", "c.target_pos", "reward 'mine' of this method gives values of shape (2, 3)"),
+        ("", "mine", "c.target_pos", "reward 'mine' of this method returns shape (1, 3)"),
         ("", "lift", "c.object_error", "has the RewardTerm 'lift' twice"),
-        ("import torchh", "mine", "c.object_error", "the module is there, but not all that it"),
+        ("import torchh", "mine", "c.object_error", "the module exists, but something it imports"),
     ],
 )
-def test_a_defect_of_ones_own_method_is_told_where_it_is(
+def test_a_defect_of_an_own_method_is_reported_with_its_place(
     top: str, name: str, value: str, said: str, tmp_path: Path, library_home: Path
 ) -> None:
     text = BROKEN.format(top=top, name=name, value=value)
@@ -371,7 +375,7 @@ def test_a_defect_of_ones_own_method_is_told_where_it_is(
     assert said in outcome.errors[0]
 
 
-def test_a_method_of_ones_own_needs_no_change_here(
+def test_an_own_method_needs_no_change_of_pgdm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "own_method.py").write_text(

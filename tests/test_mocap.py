@@ -1,10 +1,9 @@
-"""From a recorded hand to a start that runs use: frames, files, stores, locks, commands."""
+"""From a recorded hand to a stored start: frames, files, locks, commands."""
 
 from __future__ import annotations
 
 import threading
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import mujoco
@@ -12,24 +11,25 @@ import numpy as np
 import pytest
 
 from command_line import TINY, command
+from pgdm.config.compose import compose
 from pgdm.config.hands import own_hand
-from pgdm.config.store import compose
 from pgdm.errors import ConfigError, LibraryError
 from pgdm.experiment import assets, env_builder
-from pgdm.library import open_library, pregrasp_file
-from pgdm.library.pregrasp_file import Pregrasp
-from pgdm.pregrasp import mocap, provide
-from pgdm.pregrasp.reach_plan import ReachPlan
-from pgdm.pregrasp.recording import Recording
-from pgdm.sim.scene import Scene, build_scene
+from pgdm.library import open_library
+from pgdm.library.files import pregrasp as pregrasp_file
+from pgdm.library.files.pregrasp import Pregrasp
+from pgdm.pregrasp import on_demand as provide
+from pgdm.pregrasp.reach.plan import ReachPlan
+from pgdm.pregrasp.retarget import mocap
+from pgdm.pregrasp.retarget.recording import Recording
+from pgdm.sim.scene import Scene
+from task_scenes import opened
 
 pytestmark = pytest.mark.usefixtures("expert_home")
 
 
-@cache
 def scene(task: str, hand: str = "adroit") -> Scene:
-    cfg = compose([f"task={task}", f"hand={hand}"])
-    return build_scene(open_library(), cfg.task, cfg.hand, cfg.sim)
+    return opened(task, hand)[0]
 
 
 def expert(task: str) -> Recording:
@@ -48,8 +48,8 @@ def test_the_library_s_pregrasp_is_the_first_frame() -> None:
     assert set(made.pregrasp.note["fingertip_errors_mm"]) == set(made.fingers)
 
 
-def test_a_recording_is_moved_as_a_whole_onto_the_task_s_object() -> None:
-    """The same hand at the same object, recorded elsewhere, gives the same pose."""
+def test_a_recording_is_moved_as_a_whole_to_the_task_s_object() -> None:
+    """The same hand and object, recorded elsewhere, give the same pose."""
     library, motion = open_library(), open_library().motion("mouse-lift")
     here = expert("mouse-lift")
     assert here.position is not None and here.orientation is not None
@@ -71,8 +71,17 @@ def test_a_recording_is_moved_as_a_whole_onto_the_task_s_object() -> None:
     assert np.abs(away).max() < 1e-6
 
 
+def test_an_object_recorded_with_w_last_is_not_taken_for_another_pose() -> None:
+    here = expert("mouse-lift")
+    assert here.orientation is not None
+    wrong = replace(here, orientation=np.roll(here.orientation, -1, axis=1), ordered=False)
+    library, motion = open_library(), open_library().motion("mouse-lift")
+    with pytest.raises(ConfigError, match=r"frame 0: read as w x y z .*orientation_order: xyzw"):
+        mocap.retarget(scene("mouse-lift"), library, motion, wrong)
+
+
 def test_the_frame_before_contact() -> None:
-    """A hand that comes straight down: the last frame in which no finger is within 8 mm."""
+    """A hand that comes straight down: the last frame without a finger within 8 mm."""
     library, one = open_library(), scene("mouse-lift")
     here = expert("mouse-lift")
     assert here.position is not None and here.orientation is not None
@@ -91,13 +100,13 @@ def test_the_frame_before_contact() -> None:
         mocap.retarget(one, library, library.motion("mouse-lift"), down, frame=21)
 
 
-def test_what_is_out_of_reach_is_told() -> None:
+def test_what_is_out_of_reach_is_reported() -> None:
     library, motion = open_library(), open_library().motion("mouse-lift")
     far = expert("mouse-lift").frames[0].moved(np.eye(3), np.array([1.0, 0.0, 0.0]))
     made = mocap.retarget(scene("mouse-lift"), library, motion, Recording((far,), origin="far"))
     assert any("fingertip ends" in line for line in made.unreachable)
     assert any("the base is at the end of adroit/ARTx" in line for line in made.unreachable)
-    with pytest.raises(ConfigError, match=r"'adroit' cannot take up task 'mouse-lift'.*label"):
+    with pytest.raises(ConfigError, match=r"'adroit' cannot do task 'mouse-lift'.*label"):
         mocap.check(made, scene("mouse-lift"))
 
 
@@ -106,12 +115,12 @@ def wanted(task: str, hand: str, source: str) -> provide.Wanted:
     return provide.Wanted(cfg.task, cfg.hand, own_hand(cfg, open_library()), cfg.sim, source)
 
 
-def test_only_what_can_be_made_is_made() -> None:
+def test_only_what_can_be_computed_is_computed() -> None:
     assert not wanted("mouse-lift", "adroit", "planned").can_be_made
     assert wanted("mouse-lift", "dhand", "planned").can_be_made
     assert wanted("mouse-lift", "adroit", "mocap").can_be_made
     assert not wanted("mouse-lift", "dhand", "labeled").can_be_made
-    assert not wanted("mouse-lift", "adroit", "learned").can_be_made  # nothing is trained
+    assert not wanted("mouse-lift", "adroit", "learned").can_be_made  # no predictor was trained
     said: list[str] = []
     provide.ensure_start(
         open_library(), wanted("mouse-lift", "dhand", "none"), True, notify=said.append
@@ -136,7 +145,7 @@ def test_a_folder_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatc
         ({"depth_m": 0.004}, "hand 4 mm inside"),
     ],
 )
-def test_a_bad_plan_is_not_taken(
+def test_a_bad_plan_is_rejected(
     change: dict, said: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, motion = scene("mouse-lift"), open_library().motion("mouse-lift")
@@ -154,7 +163,7 @@ def test_a_bad_plan_is_not_taken(
     assert told == [] if said is None else said in told[0]
 
 
-def test_a_hand_without_a_pregrasp_is_followed_by_none() -> None:
+def test_a_task_without_a_pregrasp_gives_no_hand_to_follow() -> None:
     motion = open_library().motion("spheremedium-relocate")
     still = replace(motion.starts["mined"], qpos=np.zeros(36))
     with pytest.raises(ConfigError, match="neither a human hand nor a pre-grasp"):
@@ -165,10 +174,12 @@ def test_a_hand_without_a_pregrasp_is_followed_by_none() -> None:
         )
 
 
-def test_what_hangs_has_no_one_pose() -> None:
+def test_an_attached_object_has_no_single_pose() -> None:
     one, motion = scene("door-open"), open_library().motion("door-open")
     frames = expert("mouse-lift").frames[:2]
-    with pytest.raises(ConfigError, match="has 2 frames, and the object of task 'door-open' hangs"):
+    with pytest.raises(
+        ConfigError, match="has 2 frames, and the object of task 'door-open' is attached"
+    ):
         mocap.retarget(one, open_library(), motion, Recording(frames, origin="mine"))
     posed = Recording(frames[:1], np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]), "mine")
     with pytest.raises(ConfigError, match="leave object_position and object_orientation out"):
@@ -176,7 +187,7 @@ def test_what_hangs_has_no_one_pose() -> None:
 
 
 @pytest.mark.slow
-def test_one_process_makes_a_start_and_the_others_wait() -> None:
+def test_one_process_computes_a_start_and_the_others_wait() -> None:
     said: list[str] = []
     one = wanted("mouse-lift", "dmanus", "planned")
 
@@ -188,7 +199,7 @@ def test_one_process_makes_a_start_and_the_others_wait() -> None:
         thread.start()
     for thread in together:
         thread.join()
-    assert sum("making it once" in line for line in said) == 1
+    assert sum("computing it once" in line for line in said) == 1
     assert sum("waiting for it" in line for line in said) == 2
     stored = pregrasp_file.read(one.path)
     again = one.path.read_bytes()
@@ -199,11 +210,10 @@ def test_one_process_makes_a_start_and_the_others_wait() -> None:
 
 
 @pytest.mark.slow
-def test_another_hand_just_works() -> None:
-    """What the paper's users would type first."""
+def test_a_run_with_another_hand_computes_its_start() -> None:
     done = command("pgdm-run", "task=mouse-lift", "hand=dhand", "run_dir=run", "--offline", *TINY)
     assert done.code == 0, done.err
-    assert "making it once by inverse kinematics" in done.err + done.out
+    assert "computing it once by inverse kinematics" in done.err + done.out
     cfg = compose(["task=mouse-lift", "hand=dhand"])
     builder = env_builder(cfg, assets(cfg, print))
     stored = pregrasp_file.find("mouse-lift", "dhand", "planned")
@@ -212,7 +222,7 @@ def test_another_hand_just_works() -> None:
     np.testing.assert_array_equal(builder.mdp.start.qpos, stored.reached.qpos)
 
 
-def test_the_command_takes_a_file(tmp_path: Path) -> None:
+def test_the_command_reads_a_file(tmp_path: Path) -> None:
     joints = expert("mouse-lift").frames[0].joints
     position, orientation = expert("mouse-lift").position, expert("mouse-lift").orientation
     assert position is not None and orientation is not None
@@ -233,7 +243,7 @@ def test_the_command_takes_a_file(tmp_path: Path) -> None:
 
 
 def test_points_of_a_hand_and_back() -> None:
-    """A robot's pose is a hand that it follows itself."""
+    """A robot hand can follow the human hand at its own points."""
     library, motion = open_library(), open_library().motion("dmanus-crackerbox")
     own = scene("dmanus-crackerbox", "dmanus")
     human = mocap.of_hand(own, motion.starts["mined"])

@@ -1,4 +1,4 @@
-"""What a motion must be to be carried, what is mended, and which files of poses are read."""
+"""Checks and corrections of motions, and reading them from files."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from pgdm.errors import ConfigError, CorruptAssetError
-from pgdm.library import pose_file
-from pgdm.library.motion_checks import Poses, TableCheck, check_motion, slower, smoothed, speeds
+from pgdm.library.checks.motion import Poses, TableCheck, check_motion, slower, smoothed, speeds
+from pgdm.library.files import poses as pose_file
 from recorded_poses import UNTURNED, line
 
 
@@ -47,10 +47,10 @@ def with_jump(at: int, by: float) -> np.ndarray:
     ("rows", "said"),
     [
         (line(0.2)[:5], r"5 poses \(0.2 s\); valid: 10 to 500"),
-        (with_jump(17, 0.15), "row 17 jumps: it lies 0.15 m from row 16"),
+        (with_jump(17, 0.15), "row 17 jumps: it is 0.15 m from row 16"),
         (line(3.0), r"moves at 3 m/s in row .*a hand follows 2.5 at most; slow it down \(--slower"),
         (turned_back(), r"accelerates by 60 m/s2 in row .*--smooth or --slower FACTOR help"),
-        (line(0.5, 60)[12:], r"moves in its first step already, 0.5 m/s .*--smooth adds a beginn"),
+        (line(0.5, 60)[12:], r"already moves in its first step, 0.5 m/s .*--smooth adds a start"),
     ],
 )
 def test_what_no_hand_can_do_is_named(rows: np.ndarray, said: str) -> None:
@@ -58,19 +58,19 @@ def test_what_no_hand_can_do_is_named(rows: np.ndarray, said: str) -> None:
         check_motion(poses(rows), "it")
 
 
-def test_a_turn_that_is_torn_is_a_jump_too() -> None:
+def test_a_sudden_turn_is_a_jump_too() -> None:
     rows = line(0.2)
     rows[20:, 3:] = [np.cos(0.6), 0, 0, np.sin(0.6)]
-    with pytest.raises(ConfigError, match=r"row 20 jumps: it lies 1.2 rad from row 19"):
+    with pytest.raises(ConfigError, match=r"row 20 jumps: it is 1.2 rad from row 19"):
         check_motion(poses(rows), "it")
 
 
 def test_smoothing_gives_rests_and_slowing_divides_speeds() -> None:
-    torn = poses(line(0.5, 60)[12:])
-    mended = smoothed(torn)
-    check_motion(mended, "it")
-    assert mended.pos[0] == pytest.approx(torn.pos[0], abs=1e-4)
-    assert mended.pos[-1] == pytest.approx(torn.pos[-1], abs=1e-4)
+    cut = poses(line(0.5, 60)[12:])
+    smooth = smoothed(cut)
+    check_motion(smooth, "it")
+    assert smooth.pos[0] == pytest.approx(cut.pos[0], abs=1e-4)
+    assert smooth.pos[-1] == pytest.approx(cut.pos[-1], abs=1e-4)
     fast = poses(line(3.0, 60))
     slow = slower(fast, 2.0)
     assert len(slow.pos) == 2 * 60 - 1
@@ -118,22 +118,27 @@ def test_poses_come_from_csv_json_and_npz() -> None:
     Path("d.json").write_text(json.dumps({"poses": rows.tolist(), "time": times.tolist()}))
     np.savez("e.npz", object=rows, time=times)
     np.savez("f.npz", object_translation=rows[:, :3], object_orientation=rows[:, 3:])
+    assumed = ["the columns have no names and were read as x y z qw qx qy qz"]
     for name in ("a.csv", "c.json", "f.npz"):
         found = pose_file.read(Path(name))
-        assert found.pos == pytest.approx(rows[:, :3]) and found.repairs == []
+        assert found.pos == pytest.approx(rows[:, :3])
+        assert found.repairs == ([] if found.named else assumed)
+        assert found.named == (name == "f.npz")
     for name in ("b.csv", "d.json", "e.npz"):  # recorded at 50 Hz: every second row
         found = pose_file.read(Path(name))
         assert found.pos == pytest.approx(rows[::2, :3], abs=1e-9)
-        assert found.repairs == ["resampled 30 rows over 0.58 s to 15, 0.04 s apart"]
+        resampled = ["resampled 30 rows over 0.58 s to 15, 0.04 s apart"]
+        assert found.repairs == (resampled if found.named else assumed + resampled)
+        assert found.named == (name == "b.csv")
 
 
-def test_quaternions_a_little_off_are_normalised_and_said() -> None:
+def test_slightly_wrong_quaternions_are_normalised_and_reported() -> None:
     rows = line(0.2)
     rows[:, 3:] *= 1.001
     rows[7, 3:] *= -1
     found = pose_file.resampled(rows, None, "it")
     assert found.quat == pytest.approx(np.tile(UNTURNED, (30, 1)))
-    assert "normalised quaternions, whose norms were up to 0.001 off 1" in found.repairs
+    assert "normalised quaternions, whose norms were off 1 by up to 0.001" in found.repairs
 
 
 def changed(row: int, column: int, value: float) -> np.ndarray:
@@ -166,6 +171,14 @@ def test_rows_that_are_no_poses_are_named(
     [
         ("a.csv", b"1,2,3\n", "rows have 3 columns, expected 7"),
         ("a.csv", b"", "rows have no columns"),
+        ("a.csv", b"a,b,c,d,e,f,g\n1,2,3,1,0,0,0\n", "has 0 columns 'x' among a, b"),
+        ("a.csv", b"x_mm,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n", "has 0 columns 'x' among x_mm"),
+        ("a.csv", b"x,y,z,w,x,y,z\n1,2,3,1,0,0,0\n", "has 2 columns 'x'"),
+        ("a.csv", b"x,y,z,roll,pitch,yaw\n1,2,3,0,0,0\n", "has 0 columns 'qw'"),
+        ("a.csv", b"x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0\n", "rows have 6 columns, expected 7"),
+        ("a.csv", b"vel.x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n", "has 0 columns 'x'"),
+        ("a.json", b'{"poses": [[1, 2]], "columns": ["x"]}', r"rows have shape \(1, 2\) for 1"),
+        ("a.json", b'[{"x": 1}, {"y": 2}]', "lacks 'x'"),
         ("a.csv", b"0,0,0,1,0,0,0\n0,0,x,1,0,0,0\n", "row 1 has 'x', not a number"),
         ("a.json", b"{}", "lacks 'poses'"),
         ("a.json", b"[1,", "cannot be read as poses"),
@@ -182,7 +195,7 @@ def test_formats_and_missing_files_are_named() -> None:
     np.savez("a.npz", x=1)
     with pytest.raises(CorruptAssetError, match=r"has neither 'poses', 'object' nor .*it has x"):
         pose_file.read(Path("a.npz"))
-    with pytest.raises(ConfigError, match=r"format '.bag' is not read; valid: .csv, .npz, .json"):
+    with pytest.raises(ConfigError, match=r"format '.bag' is not supported; valid: .csv, .npz"):
         pose_file.read(Path("a.bag"))
     with pytest.raises(ConfigError, match="there is no such file"):
         pose_file.read(Path("none.csv"))

@@ -1,10 +1,9 @@
-"""Pre-grasps predicted from shapes: codes, vectors, the fit, its file, and candidates."""
+"""Pre-grasps predicted from shapes: codes, grasp vectors, fit, file, and candidates."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import mujoco
@@ -13,12 +12,11 @@ import pytest
 import torch
 
 from command_line import TINY, command
-from pgdm.config.store import compose
 from pgdm.errors import ConfigError, CorruptAssetError, SceneError
-from pgdm.library import Motion, open_library, pregrasp_file
 from pgdm.library.clearance import CLEARANCE_M
+from pgdm.library.files import pregrasp as pregrasp_file
 from pgdm.pregrasp.predict import weights
-from pgdm.pregrasp.predict.candidates import free_ones, propose
+from pgdm.pregrasp.predict.candidates import free_ones, freed, propose
 from pgdm.pregrasp.predict.encoding import (
     BASIS_POINTS,
     BASIS_RADIUS_M,
@@ -29,19 +27,12 @@ from pgdm.pregrasp.predict.encoding import (
 )
 from pgdm.pregrasp.predict.grasp_vector import POSITION, GraspFrame, rotation_of
 from pgdm.pregrasp.predict.predictor import Example, Predictor, anchored, example, fit, off
-from pgdm.pregrasp.predict.refine import freed
 from pgdm.sim.contact import HandContact
-from pgdm.sim.scene import Scene, build_scene
-
-
-@cache
-def task(name: str) -> tuple[Scene, Motion]:
-    cfg, library = compose([f"task={name}"]), open_library()
-    return build_scene(library, cfg.task, cfg.hand, cfg.sim), library.motion(cfg.task.motion)
+from task_scenes import opened
 
 
 def mined(name: str) -> np.ndarray:
-    return np.array(task(name)[1].starts["mined"].qpos)
+    return np.array(opened(name)[1].starts["mined"].qpos)
 
 
 def surface(geoms: str) -> np.ndarray:
@@ -53,7 +44,7 @@ def surface(geoms: str) -> np.ndarray:
     return surface_points(model, data, model.body("thing").id)
 
 
-def test_a_sphere_is_as_far_from_each_point_as_its_radius_says() -> None:
+def test_the_code_of_a_sphere_is_exact() -> None:
     code = encode(surface("<geom type='sphere' size='0.05'/>"))
     exact = np.abs(np.linalg.norm(basis(), axis=1) - 0.05)
     assert code.shape == (BASIS_POINTS,)
@@ -61,7 +52,7 @@ def test_a_sphere_is_as_far_from_each_point_as_its_radius_says() -> None:
     np.testing.assert_allclose(code * BASIS_RADIUS_M, exact, atol=0.002)
 
 
-def test_a_turned_box_is_encoded_as_it_lies() -> None:
+def test_a_turned_box_is_encoded_in_its_orientation() -> None:
     code = encode(surface("<geom type='box' size='0.04 0.02 0.03' euler='0 0 90'/>"))
     half = np.array([0.02, 0.04, 0.03])  # a quarter turn about z swaps x and y
     beyond = np.abs(basis()) - half
@@ -70,17 +61,17 @@ def test_a_turned_box_is_encoded_as_it_lies() -> None:
     np.testing.assert_allclose(code * BASIS_RADIUS_M, exact, atol=0.004)
 
 
-def test_surfaces_inside_other_parts_do_not_count() -> None:
+def test_surfaces_inside_other_parts_are_left_out() -> None:
     points = surface("<geom type='box' size='.05 .05 .05'/><geom type='sphere' size='.02'/>")
     assert np.abs(points).max(axis=1).min() > 0.0499  # nothing of the sphere is left
 
 
-def test_what_has_nothing_to_touch_is_refused() -> None:
-    with pytest.raises(SceneError, match="body 'thing' has no geom to touch"):
+def test_an_object_without_collision_geoms_is_refused() -> None:
+    with pytest.raises(SceneError, match="body 'thing' has no collision geom to encode"):
         surface("<geom size='.1' contype='0' conaffinity='0'/>")
 
 
-def test_any_six_numbers_are_a_rotation() -> None:
+def test_any_six_numbers_give_a_rotation() -> None:
     stream = np.random.default_rng(0)
     for columns in stream.standard_normal((100, 6)):
         turn = rotation_of(columns)
@@ -92,7 +83,7 @@ def test_any_six_numbers_are_a_rotation() -> None:
 
 @pytest.mark.parametrize("name", ["hammer-use1", "dhand-cup", "dmanus-crackerbox"])
 def test_a_hand_comes_back_from_its_vector(library_home: Path, name: str) -> None:
-    scene, _ = task(name)
+    scene, _ = opened(name)
     nu, objects = scene.model.nu, mined(name)
     low, high = scene.model.jnt_range[:nu].T
     frame = GraspFrame(scene, np.array([0.01, -0.05, 0.1]))
@@ -100,7 +91,7 @@ def test_a_hand_comes_back_from_its_vector(library_home: Path, name: str) -> Non
     for _ in range(20):
         qpos = objects.copy()
         qpos[:nu] = low + stream.uniform(0.05, 0.95, nu) * (high - low)
-        qpos[4] = stream.uniform(-1.5, 1.5)  # beyond a right angle two ways lead there
+        qpos[4] = stream.uniform(-1.5, 1.5)  # beyond a right angle there are two solutions
         vector = frame.vector(qpos)
         np.testing.assert_allclose(frame.qpos(vector, objects)[6:], qpos[6:], atol=1e-9)
         back = frame.qpos(vector, objects)
@@ -110,10 +101,10 @@ def test_a_hand_comes_back_from_its_vector(library_home: Path, name: str) -> Non
 
 
 def test_out_of_reach_the_base_stays_within_its_limits(library_home: Path) -> None:
-    scene, _ = task("hammer-use1")
+    scene, _ = opened("hammer-use1")
     frame, objects = GraspFrame(scene), mined("hammer-use1")
     vector = frame.vector(objects)
-    vector[POSITION] += (0.05, 0.6, 0.0)  # the slide across the table ends before
+    vector[POSITION] += (0.05, 0.6, 0.0)  # beyond the slide across the table
     qpos = frame.qpos(vector, objects)
     low, high = scene.model.jnt_range[: scene.model.nu].T
     assert (qpos[:30] >= low - 1e-9).all() and (qpos[:30] <= high + 1e-9).all()
@@ -126,8 +117,8 @@ def test_out_of_reach_the_base_stays_within_its_limits(library_home: Path) -> No
 
 
 def made_up(count: int = 12) -> tuple[list[Example], GraspFrame]:
-    """Return examples whose hand is the higher the larger their spheres are."""
-    scene, _ = task("hammer-use1")
+    """Return invented examples: the larger the sphere, the higher the hand."""
+    scene, _ = opened("hammer-use1")
     frame, found = GraspFrame(scene), []
     start = frame.vector(mined("hammer-use1"))
     for i, radius in enumerate(np.linspace(0.02, 0.08, count)):
@@ -138,12 +129,12 @@ def made_up(count: int = 12) -> tuple[list[Example], GraspFrame]:
     return found, frame
 
 
-def test_training_learns_what_depends_on_the_shape(library_home: Path) -> None:
+def test_the_fit_finds_what_depends_on_the_shape(library_home: Path) -> None:
     examples, frame = made_up()
     told: list[tuple[int, int]] = []
-    predictor = fit(examples, frame, progress=lambda i, n: told.append((i, n)))
+    predictor = fit(examples, frame, progress=lambda _, i, n: told.append((i, n)))
     assert predictor.error_m < 0.2 * predictor.mean_hand_error_m
-    # Leaving one of 12 out moves the mean away from it by a 12/11th of its distance.
+    # Leaving one of 12 out puts it at 12/11 of its distance from the mean.
     radii = np.linspace(0.02, 0.08, 12)
     expected = np.abs(radii - radii.mean()).mean() * 12 / 11
     assert predictor.mean_hand_error_m == pytest.approx(expected, rel=1e-6)
@@ -154,8 +145,8 @@ def test_training_learns_what_depends_on_the_shape(library_home: Path) -> None:
     np.testing.assert_allclose(mean.expected(examples[0].code), np.mean(vectors, axis=0))
 
 
-def test_one_object_held_in_several_ways_teaches_no_shape(library_home: Path) -> None:
-    """Its codes differ by how it was put down; that is not what tells objects apart."""
+def test_one_object_grasped_in_several_ways_shows_no_effect_of_shape(library_home: Path) -> None:
+    """Its codes differ only by how it was put down."""
     examples, frame = made_up(2)
     ways = [
         replace(examples[0], code=examples[0].code + 1e-5 * i, vector=examples[i % 2].vector)
@@ -185,7 +176,7 @@ def predictor(library_home: Path) -> Predictor:
     return fit(*made_up(), left_out=("cup",))
 
 
-def test_weights_come_back_as_they_were(predictor: Predictor) -> None:
+def test_weights_are_read_as_written(predictor: Predictor) -> None:
     path = weights.path_of("adroit")
     weights.write(path, predictor)
     back = weights.read(path, "adroit")
@@ -195,7 +186,7 @@ def test_weights_come_back_as_they_were(predictor: Predictor) -> None:
 
 def test_weights_that_do_not_fit_are_refused(predictor: Predictor, tmp_path: Path) -> None:
     path = tmp_path / "some.pt"
-    with pytest.raises(ConfigError, match="no predictor for hand 'dhand'; 'pgdm pregrasp train"):
+    with pytest.raises(ConfigError, match="no predictor for hand 'dhand'; train one with 'pgdm"):
         weights.read(path, "dhand")
     weights.write(path, predictor)
     with pytest.raises(ConfigError, match="is for hand 'adroit', not 'dhand'"):
@@ -208,7 +199,7 @@ def test_weights_that_do_not_fit_are_refused(predictor: Predictor, tmp_path: Pat
     torch.save({"format": "pgdm-predictor-0"}, path)
     with pytest.raises(CorruptAssetError, match="format 'pgdm-predictor-0', not"):
         weights.read(path, "adroit")
-    torch.save(Path("/"), path)  # an object that only code can build
+    torch.save(Path("/"), path)  # an object that needs code to unpickle
     with pytest.raises(CorruptAssetError, match="damaged"):
         weights.read(path, "adroit")
 
@@ -218,7 +209,7 @@ def test_weights_that_do_not_fit_are_refused(predictor: Predictor, tmp_path: Pat
     [
         ("slope", torch.zeros(3, 3), "shape"),
         ("mean", torch.full((33,), torch.nan), "not finite"),
-        ("objects", None, "spoils"),
+        ("objects", None, "invalid"),
     ],
 )
 def test_spoiled_weights_are_refused(
@@ -232,8 +223,8 @@ def test_spoiled_weights_are_refused(
         weights.read(path, "adroit")
 
 
-def test_a_hand_inside_an_object_is_freed_the_same_way_each_time(library_home: Path) -> None:
-    scene, _ = task("duck-lift")
+def test_a_hand_inside_an_object_is_freed_reproducibly(library_home: Path) -> None:
+    scene, _ = opened("duck-lift")
     qpos = mined("duck-lift")
     contact = HandContact(scene)
     assert contact.depth(qpos) > 0.005  # as published
@@ -246,7 +237,7 @@ def test_a_hand_inside_an_object_is_freed_the_same_way_each_time(library_home: P
 
 
 def test_candidates_touch_nothing(library_home: Path) -> None:
-    scene, _ = task("hammer-use1")
+    scene, _ = opened("hammer-use1")
     one = example(scene, mined("hammer-use1"))
     assert one is not None and one.object == "hammer"
     np.testing.assert_array_equal(one.code, object_code(scene, mined("hammer-use1")))
@@ -259,12 +250,12 @@ def test_candidates_touch_nothing(library_home: Path) -> None:
     assert found[0].moved_m < found[1].moved_m
 
 
-def test_a_door_is_neither_learned_nor_predicted(library_home: Path, predictor: Predictor) -> None:
-    scene, _ = task("door-open")
+def test_a_door_is_no_example_and_not_predicted(library_home: Path, predictor: Predictor) -> None:
+    scene, _ = opened("door-open")
     assert example(scene, mined("door-open")) is None
-    with pytest.raises(ConfigError, match="hangs on something"):
+    with pytest.raises(ConfigError, match="is attached to something"):
         propose(predictor, scene, mined("door-open"), 1)
-    other, _ = task("dhand-cup")
+    other, _ = opened("dhand-cup")
     with pytest.raises(ConfigError, match="for hand 'adroit', task 'dhand-cup' has 'dhand'"):
         propose(predictor, other, mined("dhand-cup"), 1)
 
@@ -284,19 +275,19 @@ def test_from_training_to_a_stored_pregrasp(library_home: Path, tmp_path: Path) 
     stored = pregrasp_file.find("dmanus-crackerbox", "dmanus", "learned")
     assert stored is not None and stored.note["held_out"] is False
     assert image.stat().st_size > 10_000
-    scene, _ = task("dmanus-crackerbox")
+    scene, _ = opened("dmanus-crackerbox")
     assert HandContact(scene).depth(stored.pose.qpos) == 0.0
     again = command("pgdm", *arguments, "--offline")
     assert again.code == 0
     other = pregrasp_file.find("dmanus-crackerbox", "dmanus", "learned")
     assert other is not None
     np.testing.assert_array_equal(stored.pose.qpos, other.pose.qpos)
-    # A run makes its start itself, now that a predictor is there.
+    # With a predictor, a run computes its start automatically.
     path = pregrasp_file.path_of("dmanus-coffeecan", "dmanus", "learned")
     run = ("task=dmanus-coffeecan", "pregrasp=learned", "--offline", *TINY)
     ended = command("pgdm-run", *run, f"run_dir={tmp_path / 'run'}")
     assert ended.code == 0, ended.err
-    assert "making it once by a prediction and a reach plan" in ended.err
+    assert "computing it once by prediction and a reach plan" in ended.err
     assert pregrasp_file.read(path).note["held_out"] is False
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["pregrasp_used"] == "learned"

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from pgdm import paths
+from pgdm.config.compose import compose
 from pgdm.config.groups import available
-from pgdm.config.store import compose
 from pgdm.errors import ConfigError, CorruptAssetError
 from pgdm.experiment import env_builder
-from pgdm.library import Start, open_library, pregrasp_file
-from pgdm.library.pregrasp_file import Pregrasp
+from pgdm.library import Start, open_library
+from pgdm.library.files import pregrasp as pregrasp_file
+from pgdm.library.files.pregrasp import Pregrasp
 
 
 def start(size: int, value: float, plan: int | None = None) -> Start:
@@ -46,8 +47,8 @@ def test_without_a_plan_the_pose_is_the_start(tmp_path: Path) -> None:
         ({"pose_qpos": np.array([np.nan])}, "NaN"),
         ({"pose_qvel": np.zeros(2)}, "pose_qvel"),
         ({"reached_qpos": np.zeros(3), "reached_qvel": np.zeros(3)}, "reached_qpos"),
-        ({"note": np.frombuffer(b"{", np.uint8)}, "no JSON"),
-        ({"note": np.frombuffer(b"[]", np.uint8)}, "no JSON object"),
+        ({"note": np.frombuffer(b"{", np.uint8)}, "not JSON"),
+        ({"note": np.frombuffer(b"[]", np.uint8)}, "not a JSON object"),
     ],
 )
 def test_a_damaged_file_is_named(

@@ -1,10 +1,9 @@
-"""Quality of pre-grasps: how hands close, where palms look, and what lifts."""
+"""Quality of pre-grasps: how hands close, where palms face, and what lifts."""
 
 from __future__ import annotations
 
 import json
 import math
-from functools import cache
 from pathlib import Path
 
 import mujoco
@@ -12,23 +11,16 @@ import numpy as np
 import pytest
 
 from command_line import command
-from pgdm.config.store import compose
 from pgdm.errors import ConfigError
-from pgdm.library import Motion, open_library, pregrasp_file
+from pgdm.library.files import pregrasp as pregrasp_file
 from pgdm.pregrasp.flexion import Flexion
+from pgdm.pregrasp.hand_geometry import posed
 from pgdm.pregrasp.quality import LiftTest, quality
-from pgdm.pregrasp.rollout import reset_pose
+from pgdm.pregrasp.sources import reset_pose
 from pgdm.sim.contact import FAR_M, FingertipDistance
-from pgdm.sim.scene import Scene, build_scene
+from task_scenes import opened
 
 BOX = "dmanus-crackerbox"
-
-
-@cache
-def opened(task: str) -> tuple[Scene, Motion]:
-    cfg, library = compose([f"task={task}"]), open_library()
-    scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
-    return scene, library.motion(cfg.task.motion)
 
 
 CLOSING = {
@@ -38,7 +30,7 @@ CLOSING = {
     "TF_MCP+ TF_PIP+ TF_DIP+",
     BOX: "TFJ1- TFJ2+ TFJ2e+ TFJ3+ IFJ2+ IFJ3+ LFJ2+ LFJ3+",
 }
-"""Joints that bend a finger, and which end of their range is closed, as the models show."""
+"""Joints that bend a finger, and the end of their range that is closed, from the models."""
 
 
 @pytest.mark.usefixtures("library_home")
@@ -55,34 +47,31 @@ def test_which_way_each_hand_closes(task: str) -> None:
 
 @pytest.mark.usefixtures("library_home")
 @pytest.mark.parametrize("task", CLOSING)
-def test_palms_look_down_in_the_reset_pose(task: str) -> None:
+def test_palms_face_down_in_the_reset_pose(task: str) -> None:
     scene, motion = opened(task)
     flexion = Flexion(scene)
     _, normal = flexion.palm(reset_pose(scene, motion.starts["mined"].qpos))
     assert normal @ [0.0, 0.0, -1.0] > 0.99
-    # The third base hinge turns the hand about its own length: half a turn, and it looks up.
+    # The third base hinge turns the hand about its long axis: after half a turn it faces up.
     turned = reset_pose(scene, motion.starts["mined"].qpos)
     turned[5] = np.pi
     assert flexion.palm(turned)[1] @ [0.0, 0.0, 1.0] > 0.95
 
 
 @pytest.mark.usefixtures("library_home")
-def test_fingertips_are_as_far_as_the_object_is_moved() -> None:
+def test_fingertip_distance_follows_the_object() -> None:
     scene, motion = opened("spheremedium-lift")
-    data = mujoco.MjData(scene.model)
-    slides = scene.model.nu, scene.model.nu + 1, scene.model.nu + 2
 
-    def far(way: tuple[float, float, float]) -> np.ndarray:
-        data.qpos[:] = motion.starts["mined"].qpos
-        data.qpos[list(slides)] += way
-        mujoco.mj_kinematics(scene.model, data)
-        return FingertipDistance(scene)(data)
+    def far(shift: tuple[float, float, float]) -> np.ndarray:
+        qpos = motion.starts["mined"].qpos.copy()
+        qpos[scene.model.nu : scene.model.nu + 3] += shift
+        return FingertipDistance(scene)(posed(scene, qpos))
 
     near = far((0.0, 0.0, 0.0))
     assert near.shape == (5,)
     assert (near < 0.06).all()
     assert (near > 0).all()
-    # Far away, a ball is 0.1 m farther when it is moved by 0.1 m.
+    # Far away, moving a ball by 0.1 m changes the distance by 0.1 m.
     gone = far((0.0, 0.3, 0.0))
     np.testing.assert_allclose(far((0.0, 0.4, 0.0)) - gone, 0.1, atol=0.015)
     np.testing.assert_array_equal(far((0.0, 3.0, 0.0)), FAR_M)
@@ -90,12 +79,10 @@ def test_fingertips_are_as_far_as_the_object_is_moved() -> None:
 
 @pytest.mark.usefixtures("library_home")
 @pytest.mark.parametrize("task", [*CLOSING, "door-open"])
-def test_a_fingertip_is_the_link_that_can_touch(task: str) -> None:
-    """Points of some fingertips are on bodies of their own, which touch nothing."""
+def test_fingertip_distance_is_that_of_the_last_link_with_collision_geoms(task: str) -> None:
+    """Some fingertips' points are on separate bodies, which cannot touch anything."""
     scene, motion = opened(task)
-    model, index, data = scene.model, scene.index, mujoco.MjData(scene.model)
-    data.qpos[:] = motion.starts["mined"].qpos
-    mujoco.mj_kinematics(model, data)
+    model, index, data = scene.model, scene.index, posed(scene, motion.starts["mined"].qpos)
     of_object = model.body_weldid[model.geom_bodyid] == model.body_weldid[index.object_body]
     solid = (model.geom_contype != 0) & of_object
     for point, distance in zip(index.fingertips, FingertipDistance(scene)(data), strict=True):
@@ -125,12 +112,12 @@ def test_a_good_pregrasp_lifts_and_a_hand_far_away_does_not() -> None:
     np.testing.assert_array_equal(lift.lifted(mined), other.lifted(mined))
     without = quality(scene, mined.qpos, motion.substeps, None)
     assert math.isnan(without.lift_rate)
-    with pytest.raises(ConfigError, match="another scene or speed"):
+    with pytest.raises(ConfigError, match="another scene or number of substeps"):
         quality(scene, mined.qpos, motion.substeps + 1, lift)
 
 
 @pytest.mark.usefixtures("library_home")
-def test_what_cuts_into_something_is_not_free() -> None:
+def test_a_hand_inside_something_is_not_free() -> None:
     scene, motion = opened("mug-drink3")
     found = quality(scene, motion.starts["mined"].qpos, motion.substeps, None)
     assert not found.free
@@ -144,21 +131,21 @@ def test_a_door_cannot_be_lifted() -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_checking_all_there_is_and_one_file(tmp_path: Path) -> None:
+def test_checking_all_sources_and_one_file(tmp_path: Path) -> None:
     motion = opened(BOX)[1]
     path = pregrasp_file.path_of(BOX, "dmanus", "labeled")
     pose = motion.starts["mined"]
     pregrasp_file.write(path, pregrasp_file.Pregrasp(pose, None, {}))
-    figures = tmp_path / "figures.json"
+    metrics = tmp_path / "metrics.json"
     quick = "--policies", "2"
-    done = command("pgdm", "pregrasp", "check", BOX, *quick, "--json", str(figures))
+    done = command("pgdm", "pregrasp", "check", BOX, *quick, "--json", str(metrics))
     assert done.code == 0
-    rows = json.loads(figures.read_text())
+    rows = json.loads(metrics.read_text())
     assert {row["source"] for row in rows} == {"mined", "planned", "labeled"}
     by_source = {row["source"]: row for row in rows}
     assert by_source["labeled"]["reachable"] is None
     assert "not tried (--reach)" in done.out
-    assert by_source["mined"]["reachable"] is False  # the released plan ends 16.6 mm off
+    assert by_source["mined"]["reachable"] is False  # the released plan is 16.6 mm off
     assert "base 16.6 mm off" in done.out
     assert all(row["free"] for row in rows)
     one = command("pgdm", "pregrasp", "check", str(path), *quick)
@@ -167,7 +154,7 @@ def test_checking_all_there_is_and_one_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_what_cannot_be_checked_is_told(tmp_path: Path) -> None:
+def test_what_cannot_be_checked_is_named(tmp_path: Path) -> None:
     missing = command("pgdm", "pregrasp", "check", BOX, "--source", "labeled")
     assert missing.code == 2
     assert missing.errors[0].startswith(f"error: task '{BOX}' has no pre-grasp labeled")

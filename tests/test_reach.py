@@ -1,4 +1,4 @@
-"""The reach planner: its parts by hand, its plans on real scenes, and who uses them."""
+"""The reach planner: its parts by hand, its plans on real scenes, and their users."""
 
 from __future__ import annotations
 
@@ -16,27 +16,21 @@ import pytest
 import pgdm
 from command_line import command
 from pgdm.cem import CemCfg, CrossEntropy
-from pgdm.config.store import compose
 from pgdm.errors import ConfigError, SceneError
-from pgdm.library import Motion, open_library, pregrasp_file
+from pgdm.library.files import pregrasp as pregrasp_file
 from pgdm.make import make_gym
-from pgdm.pregrasp import plans
-from pgdm.pregrasp.reach import REACH, default_steps, measure, plan_reach, play, reset_pose
-from pgdm.pregrasp.reach_plan import Goal, ReachPlan
-from pgdm.pregrasp.rollout import Rollouts, to_actions, to_targets
-from pgdm.pregrasp.waypoints import Waypoints, opposing_finger
+from pgdm.pregrasp.hand_geometry import opposing_finger
+from pgdm.pregrasp.reach import stored as plans
+from pgdm.pregrasp.reach.plan import Goal, ReachPlan, measure
+from pgdm.pregrasp.reach.planner import REACH, default_steps, plan_reach
+from pgdm.pregrasp.reach.rollout import Rollouts, play, to_actions, to_targets
+from pgdm.pregrasp.reach.waypoints import Waypoints
+from pgdm.pregrasp.sources import reset_pose
 from pgdm.sim.contact import HandContact
-from pgdm.sim.scene import Scene, build_scene
+from task_scenes import opened
 
 EASY = "banana-pass1"
-"""A task whose first candidates already reach."""
-
-
-@cache
-def opened(task: str) -> tuple[Scene, Motion]:
-    cfg, library = compose([f"task={task}"]), open_library()
-    scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
-    return scene, library.motion(cfg.task.motion)
+"""A task whose first candidates already reach the pre-grasp."""
 
 
 @cache
@@ -53,7 +47,7 @@ def store(task: str) -> ReachPlan:
     return plan
 
 
-def test_the_search_finds_the_least_of_a_bowl() -> None:
+def test_the_search_finds_the_minimum_of_a_quadratic() -> None:
     goal = np.array([1.0, -2.0, 0.5])
     search = CrossEntropy(
         np.zeros(3), np.ones(3), CemCfg(40, 6, 0.2, least=0.1), np.random.default_rng(0)
@@ -80,13 +74,13 @@ def test_a_round_of_the_search_by_hand() -> None:
     frozen = CrossEntropy(np.zeros(1), np.full(1, 2.0), CemCfg(4, 1, least=0.3), None)
     frozen.tell(samples, np.arange(4.0))
     assert frozen.std[0] == pytest.approx(0.6)
-    # Where everything diverged nothing is learnt.
+    # If everything diverged, the mean stays.
     assert not len(search.tell(samples, np.full(4, np.inf)))
     assert search.mean[0] == pytest.approx(1.5)
 
 
 @pytest.mark.usefixtures("library_home")
-def test_actions_are_shares_of_half_the_servos_ranges() -> None:
+def test_actions_scale_with_half_the_control_range() -> None:
     index = opened("hammer-use1")[0].index
     targets = np.zeros(index.num_actuators)
     targets[2] = 0.3  # of -0.3..0.5
@@ -121,28 +115,28 @@ def test_a_path_has_the_three_stages() -> None:
     paths = Waypoints(scene, goal.joints, goal.qpos, 40, 8, 0.04)
     mean, _ = paths.prior((0.003, 0.02, 0.03))
     targets = paths.targets(mean[None])[0]
-    np.testing.assert_allclose(targets[-1], goal.joints, atol=1e-9)  # and there it holds
+    np.testing.assert_allclose(targets[-1], goal.joints, atol=1e-9)  # and holds there
     np.testing.assert_allclose(targets[-7], goal.joints, atol=1e-9)
     index = scene.index
     assert (targets >= index.ctrl_low - 1e-12).all()
     assert (targets <= index.ctrl_high + 1e-12).all()
-    # Its mount turns the second slide upwards: the hand is higher on its way than at either end.
+    # The mount's second slide points up: the hand rises above both ends of its path.
     assert targets[:, 1].max() > max(0.0, goal.joints[1]) + 0.05
-    # The thumb, joints from 25, is where it shall be before the others are.
+    # The thumb, joints from 25, arrives before the other fingers.
     off = np.abs(targets - goal.joints) > 0.02
-    last = off.cumsum(0).argmax(0)  # last step at which a joint is off
+    last = off.cumsum(0).argmax(0)  # last step in which a joint is off
     assert last[25:].max() < last[8:25].max()
 
 
 @pytest.mark.usefixtures("library_home")
-def test_joints_that_a_tendon_couples_share_what_they_cannot_help() -> None:
+def test_joints_coupled_by_a_tendon_share_the_error_that_remains() -> None:
     scene, motion = opened("flashlight-lift")
     goal = Goal(scene, plans.pose_of("mined", motion, scene))
     rollouts = Rollouts(scene, reset_pose(scene, goal.qpos), 1, motion.substeps, 1)
     paths = Waypoints(scene, goal.joints, goal.qpos, 40, 8, 0.04)
     tolerance = goal.tolerance
     aim, extra = rollouts.settled(paths.above, 0.4 * tolerance, 0.7 * tolerance, 0.6)
-    # The little finger's last joints, 23 and 24, go together: 0.01 and 0.33 rad is impossible.
+    # The little finger's last joints, 23 and 24, are coupled: 0.01 and 0.33 rad is impossible.
     shift = aim - paths.above
     assert shift[23] == pytest.approx(0.07)
     assert shift[24] == pytest.approx(-0.07)
@@ -162,7 +156,7 @@ def test_the_published_plan_is_measured_as_known() -> None:
     assert plan.base_error_m == pytest.approx(0.0072, abs=2e-4)
     assert plan.beyond_rad == pytest.approx(0.1378, abs=1e-3)  # LFJ3 at -0.574 of -0.436
     assert plan.object_moved_m == pytest.approx(0.001, abs=2e-4)
-    # Two joints that a tendon couples cannot bend as the pre-grasp has them.
+    # Two joints coupled by a tendon cannot bend as in the pre-grasp.
     assert plan.failures == ["fingers 0.112 rad off"]
     plan = replace(plan, finger_error_rad=0.09)
     assert plan.reached
@@ -173,7 +167,7 @@ def test_the_published_plan_is_measured_as_known() -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_plan_reaches_and_ends_where_it_says() -> None:
+def test_a_plan_reaches_and_replays_exactly() -> None:
     scene, motion = opened(EASY)
     plan = planned(EASY)
     assert plan.reached
@@ -248,7 +242,7 @@ def test_plans_are_stored_found_and_kept() -> None:
     assert "published plan kept (--replace" in kept.out
     assert pregrasp_file.own(EASY, "adroit") == []
     made = command("pgdm", "pregrasp", "reach", EASY, "--replace")
-    assert (made.code, made.err) == (0, "")
+    assert (made.code, made.errors) == (0, [])
     assert "stored" in made.out
     own = pregrasp_file.find(EASY, "adroit", "planned")
     assert own is not None
@@ -256,13 +250,13 @@ def test_plans_are_stored_found_and_kept() -> None:
     np.testing.assert_array_equal(own.reached.qpos, planned(EASY).state.qpos)
     assert own.note["reach"]["reached"] is True
     np.testing.assert_array_equal(own.pose.qpos, opened(EASY)[1].starts["mined"].qpos)
-    # The same command again goes on where it was stopped: what it made is not made again.
+    # The same command resumes: a plan that it has found is not searched again.
     again = command("pgdm", "pregrasp", "reach", EASY, "--replace")
     assert "own plan kept (this search made it)" in again.out
 
 
 @pytest.mark.usefixtures("library_home")
-def test_plans_to_own_pregrasps_lie_beside_them() -> None:
+def test_plans_to_own_pregrasps_are_stored_with_them() -> None:
     scene, motion = opened(EASY)
     pose = motion.starts["mined"]
     path = pregrasp_file.path_of(EASY, "adroit", "labeled")
@@ -280,7 +274,7 @@ def test_plans_to_own_pregrasps_lie_beside_them() -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_failures_are_listed_and_told_by_the_exit_code() -> None:
+def test_failures_are_listed_and_set_the_exit_code() -> None:
     failed = command("pgdm", "pregrasp", "reach", EASY, "--source", "mocap")
     assert failed.code == 1
     assert f"failed: {EASY}: task '{EASY}' has no pre-grasp 'mocap'" in failed.err
@@ -304,7 +298,7 @@ def test_a_plan_is_filmed(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("library_home")
-def test_a_stopped_command_keeps_what_is_done() -> None:
+def test_a_stopped_command_keeps_finished_plans() -> None:
     code = "import sys; from pgdm.cli.main import main; sys.exit(main(sys.argv[1:]))"
     words = "pregrasp", "reach", EASY, "mug-drink3", "--replace"
     running = subprocess.Popen(
@@ -318,7 +312,7 @@ def test_a_stopped_command_keeps_what_is_done() -> None:
         if path.is_file() or running.poll() is not None:
             break
         time.sleep(0.1)
-    time.sleep(1)  # until it is in the table as well
+    time.sleep(1)  # until it is also in the table
     running.send_signal(signal.SIGINT)
     out, err = running.communicate(timeout=300)
     assert running.returncode == 130

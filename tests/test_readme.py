@@ -1,4 +1,4 @@
-"""README.md tells the truth: every command in it is run, here or by ``.ci/run``."""
+"""README.md holds: every command in it is run, here or by ``.ci/run``."""
 
 from __future__ import annotations
 
@@ -101,7 +101,15 @@ def test_every_command_is_covered() -> None:
     open_ones = [c for c in commands() if c not in covered and not c.startswith(OWN)]
     assert open_ones == [], "give each a place in tests/test_readme.py"
     stale = [c for c in covered if c not in commands()]
-    assert stale == [], "README.md has these no more"
+    assert stale == [], "README.md no longer has these"
+
+
+def test_readme_is_short_and_its_results_are_those_of_the_page() -> None:
+    assert len(README.splitlines()) <= 150
+    section = README.split("## What is reproduced\n")[1].split("\n## ")[0]
+    page = (REPOSITORY / "docs" / "results.md").read_text(encoding="utf-8")
+    number = r"\d[\d,.]*\d|\d"
+    assert set(re.findall(number, section)) - set(re.findall(number, page)) == set()
 
 
 @pytest.mark.parametrize("command", BY_CI)
@@ -171,7 +179,7 @@ def test_the_walk_leaves_what_readme_says(walked: tuple[Path, dict]) -> None:
 
 @pytest.fixture
 def dashboard(walked: tuple[Path, dict]) -> Iterator[subprocess.Popen[str]]:
-    """Start ``pgdm dashboard`` where the walk was, and stop it in the end."""
+    """Start ``pgdm dashboard`` in the folder of the walk, and stop it afterwards."""
     process = subprocess.Popen(
         ["pgdm", "dashboard", "--port", "5123"],
         cwd=walked[0],

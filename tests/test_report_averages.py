@@ -6,7 +6,7 @@ from pathlib import Path
 from report_runs import make, report, rows, text_of
 
 
-def test_ablations_stand_beside_the_papers(tmp_path: Path) -> None:
+def test_ablations_are_compared_with_the_papers(tmp_path: Path) -> None:
     names = ("none", "distance_15cm", "distance_25cm", "mean_hand", "open_hand")
     for i, name in enumerate(names):
         own = f"ablation={name}"
@@ -16,7 +16,7 @@ def test_ablations_stand_beside_the_papers(tmp_path: Path) -> None:
     assert "Ablations" in text
     found = [r for r in rows("averages") if r["table"] == "ablation"]
     columns = ("row", "tasks", "success", "paper_success", "paper_success_same_tasks")
-    # What the paper has of single tasks is of no ablation.
+    # The paper's values by task are for no ablation.
     assert [tuple(r[column] for column in columns) for r in found] == [
         ("none", "1", "0.2", "0.755", "0.831"),
         ("distance_15cm", "1", "0.3", "0.286", ""),
@@ -26,7 +26,7 @@ def test_ablations_stand_beside_the_papers(tmp_path: Path) -> None:
     ]
 
 
-def test_rows_that_are_not_the_papers_have_none_of_its_figures(tmp_path: Path) -> None:
+def test_rows_that_are_not_the_papers_have_none_of_its_values(tmp_path: Path) -> None:
     own = {
         "plain": (),
         "near": ("ablation=distance_15cm", "ablation.distance_m=0.05"),
@@ -39,23 +39,23 @@ def test_rows_that_are_not_the_papers_have_none_of_its_figures(tmp_path: Path) -
     for name, overrides in own.items():
         make(tmp_path / "runs" / name, 0.3, "task=cup-pour1", *overrides)
     report(tmp_path / "runs")
-    figures = {
+    stated = {
         (row["table"], row["setting"], row["row"]): (
             *(row["paper_success"], row["paper_com_error"]),
             row["paper_success_same_tasks"],
         )
         for row in rows("averages")
     }
-    said = {key: stated for key, stated in figures.items() if any(stated)}
+    note = {key: values for key, values in stated.items() if any(values)}
     far = "pgdm, ablation=distance_15cm"
-    assert {key for key in figures if key[0] == "ablation"} == {
+    assert {key for key in stated if key[0] == "ablation"} == {
         *(("ablation", "pgdm", "none"), ("ablation", far, "distance_15cm")),
         ("ablation", f"{far}, ablation.distance_m=0.05", "distance_15cm, distance_m=0.05"),
         *(("ablation", "graff", "none"), ("ablation", "pgdm, hand=dhand", "none")),
         ("ablation", "graff, ablation=distance_15cm", "distance_15cm"),
         ("ablation", f"{far}, hand=dhand", "distance_15cm"),
     }
-    assert said == {
+    assert note == {
         ("source", "pgdm", "all"): ("0.745", "0.00523", "0.831"),
         ("source", "pgdm", "mocap"): ("0.75", "0.00445", "0.831"),
         ("ablation", "pgdm", "none"): ("0.755", "0.00482", "0.831"),
@@ -88,24 +88,24 @@ def test_rows_of_one_name_stand_in_groups_of_their_own(tmp_path: Path) -> None:
     ]
 
 
-def test_rows_of_different_tasks_do_not_compare(tmp_path: Path) -> None:
-    said = "These rows have different tasks and do not compare by their means."
+def test_means_over_different_tasks_are_not_comparable(tmp_path: Path) -> None:
+    note = "These rows cover different tasks: their means are not comparable."
     make(tmp_path / "runs" / "cup", 0.7, "task=cup-pour1")
     make(tmp_path / "runs" / "none", 0.1, "task=cup-pour1", "pregrasp=none")
-    assert said not in text_of(report(tmp_path / "runs"))
+    assert note not in text_of(report(tmp_path / "runs"))
     make(tmp_path / "runs" / "hammer", 0.7, "task=hammer-use1")
     text = text_of(report(tmp_path / "runs"))
-    assert text.count(said) == 1
+    assert text.count(note) == 1
     assert "share no task" not in text
     apart = tmp_path / "apart"
     make(apart / "cup", 0.7, "task=cup-pour1")
     make(apart / "none", 0.1, "task=hammer-use1", "pregrasp=none")
     text = text_of(report(apart, out=apart / "out"))
-    assert f"{said} They share no task and so have no curve." in text
+    assert f"{note} They share no task, so there is no curve." in text
     assert not (apart / "out" / "baselines_curves.png").exists()
 
 
-def test_one_run_a_task_is_counted_and_no_probability(tmp_path: Path) -> None:
+def test_single_runs_are_counted_instead_of_a_probability(tmp_path: Path) -> None:
     root = tmp_path / "runs"
     scores = {"cup-pour1": (0.7, 0.1), "door-open": (0.3, 0.3), "duck-lift": (0.4, 0.2)}
     for task, pair in scores.items():
@@ -114,7 +114,7 @@ def test_one_run_a_task_is_counted_and_no_probability(tmp_path: Path) -> None:
             make(root / task / source, success, *own)
     text = text_of(report(root))
     assert "pgdm pgdm, pregrasp=none 2.5 of 3 tasks 3" in text  # the tie is a half
-    assert "All with algo=ppo_fast." in text
+    assert "Common to all: algo=ppo_fast." in text
     row = rows("statistics")[-1]
     assert (row["value"], row["low"]) == ("0.833333", "")
     assert (row["tasks"], row["runs"], row["than_runs"]) == ("3", "3", "3")

@@ -32,7 +32,7 @@ def test_mean_and_spread_by_hand(tmp_path: Path) -> None:
     assert spread[-1] == pytest.approx(0.2 * np.sqrt(2))
 
 
-def test_mean_goes_as_far_as_all_runs_have_come(tmp_path: Path) -> None:
+def test_mean_ends_with_the_shortest_run(tmp_path: Path) -> None:
     long, short = results(tmp_path, "cup-pour1").runs
     cut = {name: values[:3] for name, values in short.evaluations.items()}
     short.evaluations.update(cut)

@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from pgdm.config.store import compose_plain
+from pgdm.config.compose import compose_plain
 from pgdm.report import figures, mean_curves, tables
 from pgdm.report.results import Results
 from pgdm.report.runs import ERROR, SUCCESS
@@ -27,13 +27,13 @@ def setting(*overrides: str) -> Setting:
 
 
 def lines(axes: Axes) -> list[list[tuple[float, float]]]:
-    """Return what is drawn: frames and values of each line."""
+    """Return frames and values of each line that is drawn."""
     points = [np.asarray(line.get_xydata()).tolist() for line in axes.lines]
     return [[(round(1e6 * x), round(y, 9)) for x, y in line] for line in points]
 
 
 def bars(axes: Axes) -> tuple[list[float], list[tuple[float, ...]]]:
-    """Return what is drawn: the widths and colours of bars."""
+    """Return the widths and colours of the bars that are drawn."""
     drawn = [bar for bar in axes.patches if isinstance(bar, Rectangle)]
     return [bar.get_width() for bar in drawn], [to_rgba(bar.get_facecolor()) for bar in drawn]
 
@@ -46,7 +46,7 @@ def test_each_task_weighs_the_same_by_hand() -> None:
     plain = setting()
     one = [curve_run(plain, "a", STEEP)]
     two = [curve_run(plain, "b", {0: 0.0, 20: 0.4, 30: 0.6}), curve_run(plain, "b", FLAT, seed=1)]
-    # Of the second task 0, 0.2, 0.3 at 0, 20, 30; the first is 0.6 at 30, where all have come.
+    # The second task is 0, 0.2, 0.3 at 0, 20, 30; the first is 0.6 at 30, where the shortest ends.
     frames, mean = mean_curves.over_tasks([one, two], SUCCESS)
     assert frames.tolist() == [0, 10, 20, 30]
     assert mean.tolist() == pytest.approx([0, 0.15, 0.3, 0.45])
@@ -54,7 +54,7 @@ def test_each_task_weighs_the_same_by_hand() -> None:
     assert error.tolist() == pytest.approx([0.01, 0.0085, 0.007, 0.0055])
 
 
-def test_baselines_are_of_the_tasks_that_all_have() -> None:
+def test_baselines_are_means_over_shared_tasks() -> None:
     plain, mimic, bare = setting(), setting("method=deepmimic"), setting("pregrasp=none")
     results = Results(
         [
@@ -72,7 +72,7 @@ def test_baselines_are_of_the_tasks_that_all_have() -> None:
     rows = tables.baselines(results)
     figure = mean_curves.compared(results, rows)
     assert figure is not None
-    assert titles(figure) == ["mean of the 2 tasks that all have"]
+    assert titles(figure) == ["mean of 2 shared tasks"]
     success, error = figure.axes
     assert lines(success) == [
         [(0, 0.1), (10, 0.25), (20, 0.4)],
@@ -101,8 +101,8 @@ def test_groups_have_panels_of_their_own_and_one_scale() -> None:
     figure = mean_curves.compared(results, tables.by_ablation(results))
     assert figure is not None
     assert titles(figure) == [
-        "no further change, mean of the 1 task that all have",
-        "action=residual, mean of the 1 task that all have",
+        "no further change, mean of 1 shared task",
+        "action=residual, mean of 1 shared task",
     ]
     small, _, large, _ = figure.axes
     assert lines(small) == [[(0, 0.0), (40, 0.05)]] * 2
@@ -111,7 +111,7 @@ def test_groups_have_panels_of_their_own_and_one_scale() -> None:
 
 
 def test_a_name_of_the_legend_has_one_colour_in_all_panels() -> None:
-    # Of other methods the same ablations, and one of them in one panel only.
+    # The same ablations of two methods, and one that only one of them has.
     made = [
         *(("ablation=none",), ("ablation=mean_hand",)),
         *(("method=graff",), ("method=graff", "ablation=open_hand")),
@@ -159,7 +159,7 @@ def test_a_method_and_its_values_have_one_hue_in_all_panels() -> None:
     )
 
 
-def test_rows_that_share_no_task_are_told() -> None:
+def test_rows_that_share_no_task_are_listed() -> None:
     graff = ("method=graff", "ablation=open_hand")
     results = Results(
         [
@@ -174,14 +174,14 @@ def test_rows_that_share_no_task_are_told() -> None:
     assert [row.tasks for row in rows] == [("a",), ("b",), ("a",), ("b",)]
     figure = mean_curves.compared(results, rows)
     assert figure is not None
-    assert titles(figure) == ["method=graff, mean of the 1 task that all have"]
+    assert titles(figure) == ["method=graff, mean of 1 shared task"]
     assert mean_curves.apart(results, rows) == {"no further change"}
     once = Results([curve_run(s, "a", {40: 0.5}) for s in (setting(), setting("pregrasp=none"))])
     assert mean_curves.compared(once, tables.baselines(once)) is None
-    assert mean_curves.apart(once, tables.baselines(once)) == set()  # not for want of tasks
+    assert mean_curves.apart(once, tables.baselines(once)) == set()  # they share one
 
 
-def test_nothing_is_drawn_where_nothing_is_shared_or_evaluated() -> None:
+def test_nothing_is_drawn_without_shared_tasks_or_evaluations() -> None:
     plain, bare = setting(), setting("pregrasp=none")
     apart = Results([curve_run(plain, "a", STEEP), curve_run(bare, "b", FLAT)])
     assert len(tables.baselines(apart)) == 2
@@ -227,7 +227,7 @@ def test_bars_are_success_and_error_of_each_row() -> None:
     assert bars(error)[0] == pytest.approx([0.004, 0.005, 0.009])
     names = [label.get_text() for label in success.get_yticklabels()]
     assert names == ["pgdm with pre-grasp", "deepmimic with pre-grasp", "pgdm without pre-grasp"]
-    extent = "mean of 1 to 2 tasks,\nnot the same\n50,000,000 frames"
+    extent = "mean of 1 to 2 tasks,\nwhich differ\n50,000,000 frames"
     assert success.get_xlabel() == f"success\n{extent}"
     assert error.get_xlabel() == f"COM error [m]\n{extent}"
     for axes in (success, error):
@@ -248,7 +248,7 @@ def test_pregrasps_of_two_sources_have_names_and_hues_of_their_own() -> None:
     assert planned[:3] == none[:3] != mined[:3]
 
 
-def test_the_axis_of_interquartile_means_has_only_what_success_can_be() -> None:
+def test_the_axis_of_interquartile_means_is_the_range_of_success() -> None:
     made = setting()
     results = Results([curve_run(made, "a", STEEP)])
     for value, low, high in ((0.01, 0.0, 0.6), (0.0, np.nan, np.nan), (0.9, 0.4, 1.0)):

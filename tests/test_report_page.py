@@ -25,7 +25,7 @@ STATISTICS, CURVES = ["iqm", "profiles"], ["curves", "curves_error"]
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return two settings on three tasks, with a failed and a running run and a missing seed."""
+    """Return two settings on three tasks, with a failed run, a running one and a missing seed."""
     root = tmp_path_factory.mktemp("report") / "runs"
     for seed, success in enumerate((0.5, 0.7)):
         make(root / f"cup{seed}", success, "task=cup-pour1", f"seed={seed}")
@@ -43,11 +43,11 @@ def page(runs: Path) -> Path:
     return write_report([str(runs)], runs.parent / "out", lambda *_: None)[0]
 
 
-def test_what_the_page_says(page: Path) -> None:
+def test_the_text_of_the_page(page: Path) -> None:
     text = text_of(page.read_text())
     assert "6 finished 1 running 1 failed" in text
     assert "smoke budget" in text
-    assert "All runs train for 40,960 frames; the paper's figures are after 50,000,000." in text
+    assert "All runs train for 40,960 frames; the paper's values are after 50,000,000." in text
     assert "1 run failed and counts in no average" in text
     assert "the disk is full" in text
     # Success, paper, difference in points, doing nothing, mean action.
@@ -66,14 +66,16 @@ def test_what_the_page_says(page: Path) -> None:
 def test_no_better_than_doing_nothing_is_red(page: Path) -> None:
     text = page.read_text()
     found = re.findall(r'<th>([a-z0-9-]+)</th>\s*<td class="bad"><b>', text)
-    assert found == ["toothbrush-lift"]  # 30% where nothing gives 45%; failed runs have no number
+    assert found == ["toothbrush-lift"]  # 30%; doing nothing gives 45%
     overview = text[text.index('id="overview"') : text.index('id="source"')]
     assert re.findall(r'<b class="bad">(.*?)</b>', overview) == ["30.0%"]
     assert re.findall(r'<b class="">(.*?)</b>', overview) == ["60.0%", "10.0%", "80.0%"]
 
 
 def test_exactly_as_good_as_doing_nothing_is_no_better(tmp_path: Path) -> None:
-    make(tmp_path / "runs" / "a", 1 / 19, "task=spheremedium-lift")  # nothing has 1 of 19 steps
+    make(
+        tmp_path / "runs" / "a", 1 / 19, "task=spheremedium-lift"
+    )  # 1 of 19 steps by doing nothing
     make(tmp_path / "runs" / "b", 0.0527, "task=spheremedium-lift", "pregrasp=none")
     text = report(tmp_path / "runs")
     assert re.findall(r'class="bad">(?:<b>)?(5.3%)', text) == ["5.3%"] * 2  # in both tables
@@ -86,7 +88,7 @@ def test_all_files_are_there_and_pictures_are_whole(page: Path) -> None:
     averages = ["baselines", "baselines_curves", "mean_curves"]
     assert [p.stem for p in pictures] == sorted([*averages, *STATISTICS, *CURVES])
     inside = re.findall(r'src="data:image/(?:png|jpeg);base64,([^"]+)"', page.read_text())
-    # A panel a task and metric, films.
+    # A panel for each task and metric, videos.
     assert len(inside) == len([*averages, *STATISTICS]) + 3 * len(CURVES) + 8
     for data in inside:
         with Image.open(io.BytesIO(base64.b64decode(data))) as picture:
@@ -102,7 +104,7 @@ def test_nothing_is_loaded_from_elsewhere(page: Path) -> None:
     assert all((page.parent / film).read_bytes() == b"film" for film in films)
 
 
-def test_numbers_can_be_computed_anew_from_runs(page: Path) -> None:
+def test_numbers_follow_from_the_runs(page: Path) -> None:
     out = page.parent
     scores: dict[tuple[str, str], list[float]] = {}
     for run in rows("runs", out):
@@ -146,13 +148,13 @@ def test_table_one_and_baselines(page: Path) -> None:
 def test_the_overview_has_settings_as_rows_if_they_are_more_than_tasks(tmp_path: Path) -> None:
     make(tmp_path / "runs" / "a", 0.7, "task=cup-pour1")
     make(tmp_path / "runs" / "b", 0.2, "task=door-open")
-    assert "setting cup-pour1 door-open" not in text_of(report(tmp_path / "runs"))
+    assert "configuration cup-pour1 door-open" not in text_of(report(tmp_path / "runs"))
     for source in ("mined", "none"):
         make(tmp_path / "runs" / source, 0.1, "task=cup-pour1", f"pregrasp={source}")
     text = text_of(report(tmp_path / "runs"))
     assert (
-        "setting cup-pour1 door-open pgdm&nbsp;† 70.0% 20.0% pgdm, pregrasp=mined&nbsp;† 10.0%"
-        in text
+        "configuration cup-pour1 door-open pgdm&nbsp;† 70.0% 20.0% "
+        "pgdm, pregrasp=mined&nbsp;† 10.0%" in text
     )
     assert "paper 83.1% 92.2% doing nothing 0.0% 0.0%" in text
 
@@ -175,7 +177,7 @@ def test_nothing_has_finished_yet(tmp_path: Path) -> None:
     assert "0 running" in text
 
 
-def test_a_task_that_the_paper_lacks(tmp_path: Path) -> None:
+def test_a_task_that_is_not_in_the_paper(tmp_path: Path) -> None:
     make(tmp_path / "runs" / "a", 0.7, "task=dmanus-sim2real")
     text = text_of(report(tmp_path / "runs"))
     assert "dmanus-sim2real 70.0% - -" in text
@@ -184,8 +186,8 @@ def test_a_task_that_the_paper_lacks(tmp_path: Path) -> None:
 
 def test_command(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", str(runs)]) == 0
-    said = capsys.readouterr().out
-    assert said == (
+    printed = capsys.readouterr().out
+    assert printed == (
         f"8 runs (6 finished, 1 running, 1 failed): {runs / 'report' / 'report.html'}\n"
     )
     assert main(["report", str(runs), "--out", "there"]) == 0  # its own output is no run
@@ -225,7 +227,7 @@ FRAME = """<script>addEventListener("message", e => document.title = e.data)</sc
 @pytest.mark.parametrize("width", [390, 1280])
 def test_fits_phone_and_desktop(page: Path, tmp_path: Path, width: int) -> None:
     assert CHROMIUM is not None
-    text = page.read_text().replace("<details >", "<details open>")  # so that nothing hides
+    text = page.read_text().replace("<details >", "<details open>")  # so that nothing is hidden
     text = re.sub(r"<meta http-equiv[^>]+>", "", text).replace("</body>", f"{PROBE}</body>")
     (tmp_path / "probe.html").write_text(text, encoding="utf-8")
     (tmp_path / "frame.html").write_text(FRAME.format(width), encoding="utf-8")

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from pgdm.config.store import compose_plain
+from pgdm.config.compose import compose_plain
 from pgdm.report.settings import Setting, labels, setting_of, shared
 
 
@@ -21,13 +21,13 @@ def test_the_papers_own_setting_differs_in_nothing() -> None:
 
 
 @pytest.mark.parametrize("task", ["dhand-cup", "dmanus-crackerbox", "door-open"])
-def test_task_and_seed_and_their_hand_are_not_part_of_it(task: str) -> None:
+def test_task_seed_and_own_hand_are_not_part_of_it(task: str) -> None:
     assert setting(f"task={task}", "seed=3") == setting("task=cup-pour1")
 
 
-def test_nor_is_what_changes_no_result() -> None:
-    beside = ("num_threads=3", "tracking=none", "eval.video=false", "run_dir=x")
-    assert setting("task=cup-pour1", *beside) == setting("task=cup-pour1")
+def test_keys_that_change_no_result_are_not_part_of_it() -> None:
+    harmless = ("num_threads=3", "tracking=none", "eval.video=false", "run_dir=x")
+    assert setting("task=cup-pour1", *harmless) == setting("task=cup-pour1")
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_changes_are_the_overrides(overrides: tuple[str, ...], changes: tuple[st
     assert setting("task=cup-pour1", *overrides).changes == changes
 
 
-def test_an_option_of_somebody_else() -> None:
+def test_an_option_of_the_users_own() -> None:
     config = compose_plain(["task=cup-pour1"])
     other = setting_of(config | {"method": {**config["method"], "name": "near", "gain": 2.0}})
     assert other.changes == ("method=near", "method.gain=2.0")
@@ -57,7 +57,7 @@ def test_fewer_frames_are_a_deviation_and_more_are_none() -> None:
     assert setting("total_frames=60_000_000").deviations() == []
 
 
-def test_labels_leave_out_what_is_shared_and_it_is_said_once() -> None:
+def test_labels_leave_out_shared_changes() -> None:
     one = setting("algo=ppo_fast", "action=residual")
     two = setting("algo=ppo_fast", "pregrasp=none")
     assert labels([one]) == {one: "pgdm, action=residual, algo=ppo_fast"}
@@ -72,7 +72,7 @@ def test_labels_leave_out_what_is_shared_and_it_is_said_once() -> None:
     assert list(labels([one, short]).values()) == ["pgdm, 50,000,000 frames", "pgdm, 4,096 frames"]
 
 
-def test_runs_that_the_time_ended_are_not_averaged_with_whole_ones() -> None:
+def test_runs_out_of_time_are_not_averaged_with_complete_ones() -> None:
     config = compose_plain(["task=cup-pour1", "time_limit_min=10"])
     assert setting_of(config) == setting("task=cup-pour1")  # it had all its frames
     assert setting_of(config, out_of_time=True).changes == ("time_limit_min=10",)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fake_runs import empty_database
-from pgdm.config.store import compose_plain
+from pgdm.config.compose import compose_plain
 from pgdm.errors import RunError, TrackingError
 from pgdm.report.results import Results
 from pgdm.report.runs import RETURN, SUCCESS, Run
@@ -59,7 +59,7 @@ def test_states(tmp_path: Path) -> None:
     assert [len(v) for v in results.scores(setting).values()] == [1]
 
 
-def test_a_sweeps_jobs_that_have_not_begun_are_missing(tmp_path: Path) -> None:
+def test_a_sweeps_jobs_that_have_not_started_are_missing(tmp_path: Path) -> None:
     sweep = tmp_path / "sweep"
     make(sweep / "a", 0.8, "task=cup-pour1")
     make(tmp_path / "elsewhere", 0.6, "task=cup-pour1", "seed=1")
@@ -77,7 +77,7 @@ def test_a_sweeps_jobs_that_have_not_begun_are_missing(tmp_path: Path) -> None:
     assert found.commands == ["pgdm-run -m task=cup-pour1 seed=0,1,2"]
 
 
-def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
+def test_runs_that_cannot_be_read_are_listed(tmp_path: Path) -> None:
     make(tmp_path / "a", 0.8, "task=cup-pour1")
     make(tmp_path / "b", 0.8, "task=door-open")
     (tmp_path / "b" / "config.yaml").write_text("][")
@@ -112,7 +112,7 @@ def test_mlflow(tmp_path: Path, empty_database: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         assert [done.action for done in sync(root)] == ["created", "created"]
-        Group(root / "sweep", store_uri(root), "pgdm").open("sweep", {})  # is no result
+        Group(root / "sweep", store_uri(root), "pgdm").open("sweep", {})  # is not a run
         linked = read("pgdm")
         assert {run.path for run in linked.runs} == {run.path for run in direct.runs}
         (root / "a").rename(tmp_path / "gone-a")

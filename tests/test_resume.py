@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from pgdm.rl.checkpoint import CheckpointFolder
-from pgdm.tracking.run_folder import read_json
-from pgdm.tracking.run_log import RunLog
+from pgdm.runs.files import read_json
+from pgdm.runs.log import RunLog
 
 SMALL = (
     "task=dmanus-sim2real",  # its resets draw random numbers too
@@ -102,12 +102,12 @@ def test_a_signal_saves_and_the_same_command_goes_on(
     process.send_signal(number)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 128 + number
-    assert "the same command goes on" in err
+    assert "the same command resumes" in err
     assert read_json(folder / "result.json")["status"] == "interrupted"
     lines = len(log.read())
     assert CheckpointFolder(folder / "checkpoints", 2).latest()["iteration"] >= 3
     done = subprocess.run(arguments, capture_output=True, text=True, check=True)
-    assert "continuing" in done.stderr
+    assert "resuming" in done.stderr
     assert len(log.read()) > lines
     assert read_json(folder / "result.json")["status"] == "finished"
 

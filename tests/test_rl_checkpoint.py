@@ -31,7 +31,7 @@ def saved(folder: Path, *frames: int, keep_last: int = 5) -> CheckpointFolder:
     return made
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+def test_a_state_survives_writing_and_reading(tmp_path: Path) -> None:
     write_checkpoint(tmp_path / "new" / "a.ckpt", STATE)
     state = read_checkpoint(tmp_path / "new" / "a.ckpt")
     assert torch.equal(state["weights"]["a"], STATE["weights"]["a"])
@@ -41,7 +41,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("keep", [0, 10, -1, -40])
-def test_a_file_cut_off_anywhere_is_refused(tmp_path: Path, keep: int) -> None:
+def test_a_truncated_file_is_refused(tmp_path: Path, keep: int) -> None:
     path = tmp_path / "a.ckpt"
     write_checkpoint(path, STATE)
     path.write_bytes(path.read_bytes()[:keep])
@@ -49,7 +49,7 @@ def test_a_file_cut_off_anywhere_is_refused(tmp_path: Path, keep: int) -> None:
         read_checkpoint(path)
 
 
-def test_a_flipped_bit_is_found(tmp_path: Path) -> None:
+def test_a_flipped_bit_is_detected(tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     write_checkpoint(path, STATE)
     raw = bytearray(path.read_bytes())
@@ -78,12 +78,12 @@ def test_a_file_that_would_run_code_is_refused_and_runs_nothing(tmp_path: Path) 
     with pytest.raises(CheckpointError, match="refused"):
         read_checkpoint(path)
     path.write_bytes(pickle.dumps(Hostile(tmp_path / "trace")))
-    with pytest.raises(CheckpointError, match="no checkpoint of pgdm"):
+    with pytest.raises(CheckpointError, match="not a pgdm checkpoint"):
         read_checkpoint(path)
     assert not (tmp_path / "trace").exists()
 
 
-def test_what_could_not_be_read_back_is_not_written(tmp_path: Path) -> None:
+def test_a_state_that_could_not_be_read_back_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="more than tensors and plain values"):
         write_checkpoint(tmp_path / "a.ckpt", {"path": Path("x")})
     assert not list(tmp_path.iterdir())
@@ -94,7 +94,7 @@ def test_a_missing_file(tmp_path: Path) -> None:
         read_checkpoint(tmp_path / "a.ckpt")
 
 
-def test_the_newest_are_kept_and_the_best_besides(tmp_path: Path) -> None:
+def test_the_newest_and_the_best_are_kept(tmp_path: Path) -> None:
     folder = saved(tmp_path, keep_last=2)
     folder.save_best({"frames": 0})
     for frames in (0, 4096, 8192, 1_000_000):
@@ -107,7 +107,7 @@ def test_the_newest_are_kept_and_the_best_besides(tmp_path: Path) -> None:
     assert folder.latest() == {"frames": 1_000_000}
 
 
-def test_a_damaged_newest_is_passed_over_with_a_warning(
+def test_a_damaged_newest_is_skipped_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = saved(tmp_path, 1, 2, 3)
@@ -120,7 +120,7 @@ def test_a_damaged_newest_is_passed_over_with_a_warning(
     assert "the one before" in caplog.text
 
 
-def test_a_damaged_newest_does_not_push_out_good_ones(tmp_path: Path) -> None:
+def test_a_damaged_newest_does_not_displace_good_ones(tmp_path: Path) -> None:
     folder = saved(tmp_path, 100, 200, keep_last=2)
     (folder.folder / "frames_000000000200.ckpt").write_bytes(b"cut")
     assert folder.latest() == {"frames": 100}
@@ -133,7 +133,7 @@ def test_a_damaged_newest_does_not_push_out_good_ones(tmp_path: Path) -> None:
     assert folder.latest() == {"frames": 180}
 
 
-def test_none_readable_is_an_error_and_none_at_all_is_not(tmp_path: Path) -> None:
+def test_no_readable_checkpoint_is_an_error_but_no_checkpoint_is_not(tmp_path: Path) -> None:
     folder = saved(tmp_path, 1)
     folder.all()[0].write_bytes(b"")
     with pytest.raises(CheckpointError, match=r"none of the 1 checkpoints in .*another run_dir"):
@@ -147,7 +147,7 @@ from pathlib import Path
 import torch
 from pgdm.errors import CheckpointError
 from pgdm.rl.checkpoint import CheckpointFolder
-resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))  # files end here, as on a full disk
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))  # as on a full disk
 folder = CheckpointFolder(Path(sys.argv[1]), 1)
 folder.save({"small": torch.zeros(10)}, 1)
 try:
@@ -158,7 +158,7 @@ print(sorted(p.name for p in Path(sys.argv[1]).iterdir()), list(folder.latest())
 """
 
 
-def test_a_full_disk_is_one_line_and_leaves_the_old_ones(tmp_path: Path) -> None:
+def test_a_full_disk_is_one_line_and_keeps_earlier_checkpoints(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", DISK_FULL, str(tmp_path)], capture_output=True, text=True, check=True
     )
@@ -168,13 +168,13 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_ones(tmp_path: Path) -> None
     assert listing == "['frames_000000000001.ckpt'] ['small']"
 
 
-def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_created(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(CheckpointError, match=r"cannot write .*: (Not a dir|File ex)"):
         CheckpointFolder(tmp_path / "file", 1).save(STATE, 1)
 
 
-def test_what_a_killed_writer_left_is_cleaned_up(tmp_path: Path) -> None:
+def test_leftovers_of_a_killed_writer_are_deleted(tmp_path: Path) -> None:
     folder = saved(tmp_path, 1)
     stale = folder.folder / ".tmp-123-frames_000000000002.ckpt"
     stale.write_bytes(b"half")

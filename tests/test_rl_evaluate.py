@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from pgdm.errors import CheckpointError
-from pgdm.rl.checkpoint import CheckpointFolder, write_checkpoint
-from pgdm.rl.evaluate import Evaluator, load_policy, run_episodes, summarise
+from pgdm.rl.checkpoint import CheckpointFolder, read_checkpoint, write_checkpoint
+from pgdm.rl.evaluate import Evaluator, policy_of, run_episodes, summarise
 from pgdm.rl.learner import AlgoCfg
 from pgdm.rl.trainer import Extras, Trainer
 from pgdm.seeding import torch_stream
@@ -36,7 +36,7 @@ class Noisy(Still):
 
 
 class LadderEnv(PointEnv):
-    """Simulation i's episodes take i + 1 steps; success is how many it has finished by then."""
+    """Simulation i's episodes take i + 1 steps; success is the number it has finished so far."""
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs)
@@ -61,20 +61,20 @@ def test_only_the_first_episode_of_each_simulation_counts() -> None:
     assert results["finished"].tolist() == [1, 1, 1, 1, 1]
 
 
-def test_means_and_spreads() -> None:
+def test_means_and_standard_deviations() -> None:
     summary = summarise({"length": torch.tensor([1.0, 2, 3]), "one": torch.tensor([4.0])}, "a/")
     assert summary == {"a/length": 2.0, "a/length_std": 1.0, "a/one": 4.0}
 
 
-def test_names_of_sampled_and_deterministic() -> None:
+def test_names_of_sampled_and_deterministic_metrics() -> None:
     metrics = Evaluator(lambda n: PointEnv(n, seed=1), 3, 1, seed=0).evaluate(Noisy())
     assert metrics is not None
     assert {"eval_sampled/return", "eval_sampled/return_std"} <= metrics.keys()
     assert "eval_deterministic/return" in metrics
-    assert "eval_deterministic/return_std" not in metrics  # of one episode there is none
+    assert "eval_deterministic/return_std" not in metrics  # needs two episodes
 
 
-def test_repeats_to_the_bit_and_leaves_every_other_stream_alone() -> None:
+def test_it_repeats_to_the_bit_and_touches_no_other_stream() -> None:
     evaluator = Evaluator(lambda n: PointEnv(n, seed=1), 8, 2, seed=0)
     before = torch.random.get_rng_state()
     first = evaluator.evaluate(Noisy())
@@ -97,16 +97,16 @@ def test_environments_are_built_once() -> None:
     assert built == [8, 2]
 
 
-def test_a_stop_gives_up_between_steps() -> None:
-    asked: list[int] = []
+def test_a_stop_abandons_the_evaluation_between_steps() -> None:
+    polled: list[int] = []
 
     def stop() -> bool:
-        asked.append(1)
-        return len(asked) > 3
+        polled.append(1)
+        return len(polled) > 3
 
     evaluator = Evaluator(lambda n: PointEnv(n), 4, 1, seed=0)
     assert evaluator.evaluate(Still(), stop) is None
-    assert len(asked) == 4
+    assert len(polled) == 4
     assert evaluator.evaluate(Still()) is not None
 
 
@@ -126,7 +126,7 @@ def test_a_loaded_policy_acts_like_the_trained_one(
     trainer = Trainer(PointEnv(scale=30.0), cfg, Extras(checkpoints=CheckpointFolder(tmp_path, 1)))
     trainer.run()
     [path] = CheckpointFolder(tmp_path, 1).all()
-    policy = load_policy(path)
+    policy = policy_of(read_checkpoint(path), path)
     obs = 30 * torch.randn(4, 5, generator=torch_stream(0, "test"))
     mean = trainer.model.act(obs, deterministic=True)
     assert torch.equal(policy.act(obs, deterministic=True), mean)
@@ -139,4 +139,4 @@ def test_a_loaded_policy_acts_like_the_trained_one(
 def test_a_checkpoint_without_a_policy_is_refused(tmp_path: Path, network: object) -> None:
     write_checkpoint(tmp_path / "a.ckpt", {"network": network})
     with pytest.raises(CheckpointError, match="holds no policy"):
-        load_policy(tmp_path / "a.ckpt")
+        policy_of(read_checkpoint(tmp_path / "a.ckpt"), tmp_path / "a.ckpt")

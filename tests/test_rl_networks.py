@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from pgdm.errors import RunError
-from pgdm.rl.networks import ActorCritic, NetworkCfg, gaussian_log_prob
+from pgdm.rl.networks import ActorCritic, Gaussian, NetworkCfg
 from pgdm.seeding import torch_stream
 
 CFG = NetworkCfg(
@@ -74,12 +74,13 @@ def test_samples_follow_the_gaussian_and_are_not_clipped() -> None:
     assert not action.requires_grad
 
 
-def test_log_prob_is_that_of_independent_normals() -> None:
-    mean, log_std = torch.tensor([[0.0, 2.0]]), torch.tensor([0.0, -1.0])
-    action = torch.randn(50, 2, generator=torch_stream(0, "test"))
-    normal = torch.distributions.Normal(mean, log_std.exp())
-    log_prob = gaussian_log_prob(mean, log_std, action)
-    torch.testing.assert_close(log_prob, normal.log_prob(action).sum(1))
+def test_log_prob_and_entropy_equal_torch() -> None:
+    generator = torch_stream(0, "test")
+    mean, action = torch.randn(4, 3, generator=generator), torch.randn(4, 3, generator=generator)
+    log_std = torch.tensor([-1.6, 0.0, 0.5])
+    normal, ours = torch.distributions.Normal(mean, log_std.exp()), Gaussian(mean, log_std)
+    torch.testing.assert_close(ours.log_prob(action), normal.log_prob(action).sum(1))
+    torch.testing.assert_close(ours.entropy(), normal.entropy()[0].sum())
 
 
 def test_act_samples_from_the_given_stream() -> None:

@@ -2,14 +2,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
 from pgdm.errors import ConfigError, RunError
-from pgdm.rl import ppo as ppo_module
-from pgdm.rl.collector import Collector, Rollout
+from pgdm.rl.collector import RolloutCollector
 from pgdm.rl.networks import ActorCritic, NetworkCfg
 from pgdm.rl.ppo import PPOCfg, PPOLearner, check_batch, explained_variance
 from pgdm.rl.vec_env import VecEnv
@@ -17,30 +17,34 @@ from pgdm.seeding import torch_stream
 from toy_envs import PAPER, TOY, PointEnv, ScriptedEnv
 
 
-def build(env: VecEnv, cfg: PPOCfg, num_threads: int = 1) -> tuple[PPOLearner, Collector]:
+def build(env: VecEnv, cfg: PPOCfg, num_threads: int = 1) -> tuple[PPOLearner, RolloutCollector]:
     network = NetworkCfg(
         env.obs_dim, env.action_dim, cfg.hidden, cfg.log_std_init, cfg.normalize_observations, 10.0
     )
     model = ActorCritic(network, torch_stream(0, "weights"))
     learner = PPOLearner(model, cfg, torch_stream(0, "minibatches"), num_threads)
-    collector = Collector(env, learner, cfg.steps_per_env, torch_stream(0, "actions"))
-    collector.reset()
-    return learner, collector
+    policy = TensorDictModule(model.sample, ["observation"], ["action", "loc"])
+    return learner, RolloutCollector(env, policy, frames_per_batch=cfg.steps_per_env * env.num_envs)
+
+
+def seen(rollout: TensorDict) -> torch.Tensor:
+    """Return the observations acted upon, (T * N, D), in the order they came."""
+    return rollout["observation"].transpose(0, 1).flatten(0, 1)
 
 
 def test_each_sample_is_visited_once_in_each_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
     learner, collector = build(PointEnv(8), TOY)
     visited: list[torch.Tensor] = []
-    real = ppo_module.policy_loss
+    real = learner._loss.loss_policy
 
-    def watch(*args: Any, **settings: Any) -> Any:
-        visited.append(args[2].obs)
-        return real(*args, **settings)
+    def watch(minibatch: TensorDict) -> TensorDict:
+        visited.append(minibatch["observation"])
+        return real(minibatch)
 
-    monkeypatch.setattr(ppo_module, "policy_loss", watch)
-    rollout = collector.collect()
+    monkeypatch.setattr(learner._loss, "loss_policy", watch)
+    rollout = collector.rollout()
     learner.learn(rollout)
-    samples = rollout.obs[:-1].flatten(0, 1)
+    samples = seen(rollout)
     per_epoch = len(samples) // TOY.minibatch_size
     assert len(visited) == TOY.epochs * per_epoch
     orders = [torch.cat(visited[i : i + per_epoch]) for i in range(0, len(visited), per_epoch)]
@@ -55,44 +59,44 @@ def test_the_visiting_order_comes_from_the_named_stream() -> None:
     assert torch.equal(torch.cat(learner._minibatches(256)), expected)
 
 
-def test_values_stand_for_what_was_cut_but_not_for_what_ended() -> None:
-    """With a critic that answers its observation, gamma 0.5 and lambda 0: target = r + g * V'."""
+def test_truncations_bootstrap_and_terminations_do_not() -> None:
+    """With a critic that returns its observation, gamma 0.5 and lambda 0: target = r + g * V'."""
     cfg = replace(TOY, gamma=0.5, gae_lambda=0.0, steps_per_env=3, minibatch_size=6)
     ends, cuts = torch.zeros(3, 2, dtype=torch.bool), torch.zeros(3, 2, dtype=torch.bool)
     ends[1, 0], cuts[1, 1] = True, True
     learner, collector = build(ScriptedEnv(torch.ones(3, 2), ends, cuts), cfg)
     learner.model.value = lambda obs: obs[..., 0]  # type: ignore[method-assign]
-    batch, _ = learner._prepare(collector.collect())
-    # The observation after step t is t + 1, of restarted rows its negative (never to be used).
-    ended, cut = batch.target.reshape(3, 2).T
+    batch, _ = learner._prepare(collector.rollout())
+    # The observation after step t is t + 1, after a restart its negative (must not be used).
+    ended, cut = batch["value_target"].reshape(3, 2).T
     assert ended.tolist() == [1 + 0.5 * 1, 1, 1 + 0.5 * 3]
     assert cut.tolist() == [1 + 0.5 * 1, 1 + 0.5 * 2, 1 + 0.5 * 3]
 
 
-def test_all_of_an_iteration_sees_the_same_statistics() -> None:
+def test_acting_and_learning_see_the_same_statistics() -> None:
     cfg = replace(TOY, normalize_observations=True)
     learner, collector = build(PointEnv(8, scale=30.0), cfg)
     normalizer = learner.model.normalizer
     assert normalizer is not None
-    first = collector.collect()
+    first = collector.rollout()
     batch, _ = learner._prepare(first)
-    torch.testing.assert_close(batch.obs, first.obs[:-1].flatten(0, 1).clamp(-10, 10))
+    torch.testing.assert_close(batch["observation"], seen(first).clamp(-10, 10))
     metrics = learner.learn(first)
     assert float(normalizer.count) == 256
-    second = collector.collect()
-    seen = second.obs[:-1].flatten(0, 1)
-    torch.testing.assert_close(learner._prepare(second)[0].obs, normalizer(seen))
+    second = collector.rollout()
+    samples, _ = learner._prepare(second)
+    torch.testing.assert_close(samples["observation"], normalizer(seen(second)))
     # The policy that acted and the one that learns agree: the ratios of the first step are 1.
-    logged = learner._update(learner._prepare(second)[0], torch.arange(64))
+    logged = learner._update(samples, torch.arange(64))
     kl, clipped = float(logged[3]), float(logged[4])
     assert kl == pytest.approx(0, abs=1e-6)
     assert clipped == 0
     assert math.isfinite(metrics["loss_policy"])
 
 
-def test_logged_numbers() -> None:
+def test_logged_values() -> None:
     learner, collector = build(PointEnv(8), TOY)
-    metrics = learner.learn(collector.collect())
+    metrics = learner.learn(collector.rollout())
     assert set(metrics) == {
         *("loss_policy", "loss_value", "entropy", "kl", "clip_fraction", "ess", "grad_norm"),
         *("explained_variance", "action_std", "lr"),
@@ -105,19 +109,19 @@ def test_logged_numbers() -> None:
 def test_gradients_are_scaled_down_to_the_norm() -> None:
     cfg = replace(TOY, max_grad_norm=1e-3)
     learner, collector = build(PointEnv(8), cfg)
-    batch, _ = learner._prepare(collector.collect())
+    batch, _ = learner._prepare(collector.rollout())
     logged = learner._update(batch, torch.arange(64))
-    assert float(logged[-1]) > 1e-3  # the norm before, as it is logged
+    assert float(logged[-1]) > 1e-3  # the norm before scaling is logged
     grads = torch.cat([p.grad.flatten() for p in learner.model.parameters() if p.grad is not None])
     assert float(grads.norm()) == pytest.approx(1e-3, rel=1e-3)
 
 
 def test_the_number_of_threads_does_not_change_a_bit() -> None:
-    cfg = replace(TOY, hidden=[256, 128])  # wide enough that torch could split the products
+    cfg = replace(TOY, hidden=[256, 128])  # wide enough for torch to split the products
     results = []
     for threads in (1, 2, 4):
         learner, collector = build(PointEnv(8), cfg, threads)
-        metrics = learner.learn(collector.collect())
+        metrics = learner.learn(collector.rollout())
         results.append((metrics, learner.model.state_dict()))
     for metrics, state in results[1:]:
         assert metrics == results[0][0]
@@ -126,8 +130,8 @@ def test_the_number_of_threads_does_not_change_a_bit() -> None:
 
 def test_a_loss_that_is_not_finite_is_named_and_changes_nothing() -> None:
     learner, collector = build(PointEnv(8), TOY)
-    rollout = collector.collect()
-    rollout.mean[:] = math.inf  # the actions had no probability, so ratios become infinite
+    rollout = collector.rollout()
+    rollout["loc"][:] = math.inf  # actions of probability 0: infinite ratios
     before = {name: value.clone() for name, value in learner.model.state_dict().items()}
     with pytest.raises(RunError, match=r"^loss_policy is not finite .*last checkpoint is good"):
         learner.learn(rollout)
@@ -137,8 +141,8 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing() -> None:
 
 def test_a_value_loss_that_is_not_finite_is_named() -> None:
     learner, collector = build(PointEnv(8), TOY)
-    rollout: Rollout = collector.collect()
-    rollout.reward[3, 2] = math.inf
+    rollout = collector.rollout()
+    rollout["next", "reward"][2, 3] = math.inf
     with pytest.raises(RunError, match=r"loss_value inf|loss_policy is not finite"):
         learner.learn(rollout)
 

@@ -1,4 +1,4 @@
-"""The replay: what is appended is sampled, outlives its process, and is checked when reopened."""
+"""The replay: frames are sampled, survive the process, and are verified when reopened."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def replay(folder: Path | None, capacity: int = 64, batch: int = 16, **columns: 
 
 
 def frames(first: int, count: int, sign: float = 1.0) -> dict[str, Tensor]:
-    """Return frames that say their number; whole numbers below 2048 are exact in float16."""
+    """Return frames that hold their number; integers below 2048 are exact in float16."""
     number = sign * torch.arange(first, first + count).float()
     return {
         "obs": number[:, None] + torch.tensor([0.0, 0.5, 0.25]),
@@ -50,7 +50,7 @@ def frames(first: int, count: int, sign: float = 1.0) -> dict[str, Tensor]:
 
 
 def content(where: Replay) -> dict[str, Tensor]:
-    """Return all frames, through the files' own memory."""
+    """Return all frames, read from the storage."""
     return {name: where._data.get(name)[: len(where)].clone() for name in where.columns}
 
 
@@ -74,7 +74,7 @@ def one_line(kind: type[PgdmError], *said: str) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("kept", ["in memory", "in files"])
-def test_whole_frames_come_back_in_single_precision(kept: str, tmp_path: Path) -> None:
+def test_complete_frames_are_sampled_in_single_precision(kept: str, tmp_path: Path) -> None:
     made = replay(None if kept == "in memory" else tmp_path / "replay")
     made.append(frames(0, 10))
     made.append(frames(10, 7))
@@ -92,12 +92,12 @@ def test_whole_frames_come_back_in_single_precision(kept: str, tmp_path: Path) -
         assert torch.equal(sample[name], column), name
 
 
-def test_a_sample_is_a_uniform_draw_of_what_was_appended() -> None:
+def test_a_sample_is_a_uniform_draw_of_all_frames() -> None:
     made = replay(None, capacity=1000, batch=10_000)
     made.append(frames(0, 5))
     counts = torch.tensor(drawn(made)).bincount(minlength=5)
     assert len(counts) == 5
-    # 2000 each; the standard deviation of each is sqrt(10000 * 0.2 * 0.8) = 40.
+    # 2000 each, with a standard deviation of sqrt(10000 * 0.2 * 0.8) = 40.
     assert ((counts - 2000).abs() < 200).all()
     made.append(frames(5, 1))
     assert set(drawn(made)) == {0, 1, 2, 3, 4, 5}
@@ -119,13 +119,13 @@ def test_a_sample_is_drawn_from_the_given_stream_alone() -> None:
     assert samples(0, outside=1) != samples(1, outside=1)
 
 
-def test_reopened_at_a_checkpoint_it_goes_on_the_same(tmp_path: Path) -> None:
+def test_reopened_at_a_checkpoint_it_continues_identically(tmp_path: Path) -> None:
     straight, stopped = replay(tmp_path / "a"), replay(tmp_path / "b")
     for made in (straight, stopped):
         made.append(frames(0, 20))
         made.sample()
     state, stream = stopped.state_dict(), stopped._buffer._rng.get_state()
-    stopped.append(frames(900, 30))  # after the checkpoint: never happened
+    stopped.append(frames(900, 30))  # after the checkpoint: discarded
     del stopped
 
     generator = torch_stream(5, "other")
@@ -140,7 +140,7 @@ def test_reopened_at_a_checkpoint_it_goes_on_the_same(tmp_path: Path) -> None:
     assert again.state_dict() == straight.state_dict()
 
 
-def test_a_longer_run_has_more_room_for_the_same_frames(tmp_path: Path) -> None:
+def test_an_extended_run_keeps_its_frames(tmp_path: Path) -> None:
     made = replay(tmp_path, capacity=8)
     made.append(frames(0, 8))
     state = made.state_dict()
@@ -155,7 +155,7 @@ def test_a_longer_run_has_more_room_for_the_same_frames(tmp_path: Path) -> None:
 
 @given(st.data())
 @settings(max_examples=25)
-def test_any_course_of_appends_and_restarts_keeps_the_frames(data: st.DataObject) -> None:
+def test_any_sequence_of_appends_and_restarts_keeps_the_frames(data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:
         made, saved, number = replay(Path(folder)), 0, 0
         state = made.state_dict()
@@ -190,7 +190,7 @@ while True:
 """
 
 
-def test_what_a_killed_process_had_saved_is_there(tmp_path: Path) -> None:
+def test_frames_saved_by_a_killed_process_are_there(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", APPENDING, str(tmp_path), str(Path(__file__).parent)],
         stdout=subprocess.PIPE,
@@ -210,7 +210,7 @@ def test_what_a_killed_process_had_saved_is_there(tmp_path: Path) -> None:
 # What goes wrong.
 
 
-def test_a_full_one_is_an_error_and_keeps_what_it_has() -> None:
+def test_a_full_replay_is_an_error_and_keeps_its_frames() -> None:
     made = replay(None, capacity=10)
     made.append(frames(0, 8))
     with one_line(RunError, "room for 10 frames", "full"):
@@ -230,14 +230,14 @@ def saved(tmp_path: Path) -> tuple[Path, dict[str, Any]]:
     return tmp_path / "replay", made.state_dict()
 
 
-def test_a_file_that_was_cut_is_refused(saved: tuple[Path, dict[str, Any]]) -> None:
+def test_a_truncated_file_is_refused(saved: tuple[Path, dict[str, Any]]) -> None:
     folder, state = saved
-    os.truncate(folder / "terms.bin", 40 * 8 - 1)  # the reopened file is filled up with zeros
+    os.truncate(folder / "terms.bin", 40 * 8 - 1)  # reopening pads the file with zeros
     with one_line(CheckpointError, str(folder), "40 frames", "column 'terms' differs", "cut"):
         replay(folder).load_state_dict(state)
 
 
-def test_a_file_that_was_cut_beyond_the_checkpoint_is_as_good(
+def test_a_file_truncated_after_the_checkpoints_frames_is_accepted(
     saved: tuple[Path, dict[str, Any]],
 ) -> None:
     folder, state = saved
@@ -249,7 +249,7 @@ def test_a_file_that_was_cut_beyond_the_checkpoint_is_as_good(
 
 @pytest.mark.parametrize("name", COLUMNS)
 @pytest.mark.parametrize("where", [0, 39])
-def test_a_byte_that_was_altered_is_noticed(
+def test_an_altered_byte_is_detected(
     saved: tuple[Path, dict[str, Any]], name: str, where: int
 ) -> None:
     folder, state = saved
@@ -263,7 +263,7 @@ def test_a_byte_that_was_altered_is_noticed(
 
 
 @pytest.mark.parametrize("removed", [["obs"], list(COLUMNS)])
-def test_files_that_are_gone_are_told_and_not_made_again(
+def test_missing_files_are_an_error_and_are_not_recreated(
     saved: tuple[Path, dict[str, Any]], removed: list[str]
 ) -> None:
     folder, state = saved
@@ -277,7 +277,7 @@ def test_files_that_are_gone_are_told_and_not_made_again(
     assert sorted(folder.iterdir()) == left
 
 
-def test_a_replay_that_was_only_in_memory_is_not_resumed() -> None:
+def test_a_replay_in_memory_cannot_be_resumed() -> None:
     made = replay(None)
     made.append(frames(1, 40))
     with one_line(CheckpointError, "memory does not hold the 40 frames"):
@@ -296,14 +296,14 @@ def test_a_replay_of_another_run_is_refused(
         replay(folder, obs=Column(torch.float16, (4,))).load_state_dict(state)
     with one_line(CheckpointError, "gone (it lacks wrist.bin)"):
         replay(folder, wrist=Column(torch.float32)).load_state_dict(state)
-    made = replay(folder)  # and the true one is still whole
+    made = replay(folder)  # and the right one is still complete
     made.load_state_dict(state)
     assert_holds(made, frames(1, 40))
 
 
 @contextmanager
 def mounted(kind: str, folder: Path, options: str = "") -> Iterator[Path]:
-    """Mount a file system that lives in memory, or skip where that is not allowed."""
+    """Mount a file system in memory, or skip the test if that is not permitted."""
     folder.mkdir()
     line = ["mount", "-t", kind, *(["-o", options] if options else []), "pgdm-test", str(folder)]
     try:
@@ -318,7 +318,7 @@ def mounted(kind: str, folder: Path, options: str = "") -> Iterator[Path]:
         subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
-def test_a_disk_without_room_is_told_at_the_start_and_stays_as_free(tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_at_the_start_and_takes_no_room(tmp_path: Path) -> None:
     with mounted("tmpfs", tmp_path / "disk", "size=1m") as disk:
         free = os.statvfs(disk).f_bfree
         with one_line(RunError, "cannot reserve 0.0 GB", "No space left", "total_frames"):
@@ -338,7 +338,7 @@ def test_a_disk_without_room_is_told_at_the_start_and_stays_as_free(tmp_path: Pa
         assert_holds(made, frames(0, 100))
 
 
-def test_a_limit_on_the_size_of_files_is_told(tmp_path: Path) -> None:
+def test_a_file_size_limit_is_an_error(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
     try:  # Python ignores the signal that comes with it
@@ -349,18 +349,18 @@ def test_a_limit_on_the_size_of_files_is_told(tmp_path: Path) -> None:
     assert list((tmp_path / "replay").iterdir()) == []
 
 
-def test_a_file_in_the_place_of_the_folder_is_told(tmp_path: Path) -> None:
+def test_a_file_in_place_of_the_folder_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with one_line(RunError, "cannot reserve", str(tmp_path / "file" / "in" / "it")):
         replay(tmp_path / "file" / "in" / "it")
 
 
-def test_a_file_system_that_cannot_reserve_is_written_instead(tmp_path: Path) -> None:
+def test_a_file_system_that_cannot_reserve_is_filled_with_zeros(tmp_path: Path) -> None:
     with mounted("ramfs", tmp_path / "disk") as disk:  # as NFS before version 4.2
         made = replay(disk / "replay")
         made.append(frames(0, 30))
         state = made.state_dict()
-        again = replay(disk / "replay", capacity=100)  # growing keeps what is there
+        again = replay(disk / "replay", capacity=100)  # extending it keeps its frames
         again.load_state_dict(state)
         assert_holds(again, frames(0, 30))
 

@@ -24,23 +24,19 @@ from toy_envs import TOY, TOY_SAC, PointEnv, trainer_cfg
 
 ITERATIONS = 15
 PAUSE_S = 0.06
-"""Added to each iteration, so that three kills surely fall before the end."""
-# Wide enough that torch really splits the work over its threads.
+"""Added to each iteration, so that three kills fit into a training."""
+# Wide enough for torch to split the products over its threads.
 PPO = replace(TOY, steps_per_env=64, minibatch_size=256, epochs=1, hidden=[256, 128])
 ALGOS: dict[str, AlgoCfg] = {
     "ppo": PPO,
     "ppo, normalised": replace(PPO, normalize_observations=True),
-    # 8 updates an iteration: the count of those between two of the policy must be kept too.
+    # 8 updates an iteration: the count since the policy's last update must survive too.
     "sac": replace(TOY_SAC, steps_per_env=8, warmup_steps=4, batch_size=32, actor_interval=3),
 }
 
 
-SAC = ("pgdm.rl.replay", "pgdm.rl.sac_loss")
-"""What takes long to import and is imported late."""
-
-
 class Lines(Callback):
-    """Appends all metrics to a file, times aside, and takes its time."""
+    """Appends all metrics except times to a file, slowly."""
 
     def __init__(self, path: Path, pause_s: float) -> None:
         self._path, self._pause_s = path, pause_s
@@ -59,7 +55,7 @@ class Lines(Callback):
 
 
 def train(folder: Path, threads: int, algo: str, pause_s: float) -> None:
-    """Start or resume the training in a folder; runs in a process of its own."""
+    """Start or resume the training in a folder; runs in its own process."""
     frames = per_iteration(algo)
     cfg = trainer_cfg(
         ALGOS[algo],
@@ -88,7 +84,7 @@ def per_iteration(algo: str) -> int:
 
 
 def lines(folder: Path) -> dict[tuple[str, int], Any]:
-    """Return what was logged; what was logged twice must be the same twice."""
+    """Return the logged lines; lines logged twice must be equal."""
     logged: dict[tuple[str, int], Any] = {}
     for line in (folder / "lines").read_text().splitlines():
         try:
@@ -104,7 +100,8 @@ def lines(folder: Path) -> dict[tuple[str, int], Any]:
 def processes() -> Iterator[ForkServerContext]:
     """A server that has imported everything: starting a training costs milliseconds."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["test_rl_resume", "torchrl.objectives.value.functional", *SAC])
+    late = ("pgdm.rl.collector", "pgdm.rl.loss", "pgdm.rl.replay", "pgdm.rl.sac_loss")
+    context.set_forkserver_preload(["test_rl_resume", *late])
     yield context
 
 
@@ -115,7 +112,7 @@ def run(context: ForkServerContext, *args: Any) -> Any:
 
 
 def kill_at_random(process: Any, folder: Path) -> bool:
-    """Let a training come a random way beyond what it had, and kill it; tell if it was running."""
+    """Kill a training after a random number of further iterations; return if it was running."""
 
     def logged() -> int:
         file = folder / "lines"
@@ -145,7 +142,7 @@ def test_killed_three_times_equals_never_stopped(
 
     for _ in range(3):
         process = run(processes, killed, threads, algo, PAUSE_S)
-        assert kill_at_random(process, killed), "the training ended before it could be killed"
+        assert kill_at_random(process, killed), "the training finished before it could be killed"
     process = run(processes, killed, threads, algo, 0.0)
     process.join()
     assert process.exitcode == 0

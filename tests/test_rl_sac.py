@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,26 +9,28 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torchrl.objectives import SACLoss, SoftUpdate
 
 from pgdm.errors import ConfigError, RunError
 from pgdm.rl.callback import Callback, Progress
-from pgdm.rl.collector import Rollout, Step
 from pgdm.rl.evaluate import Evaluator
 from pgdm.rl.networks import ActionValue, SquashedCfg, SquashedPolicy
 from pgdm.rl.sac import SACCfg, SACLearner, columns
-from pgdm.rl.sac_loss import SoftActorCriticLoss, SoftUpdate, TensorDict
+from pgdm.rl.sac_loss import SoftActorCriticLoss
 from pgdm.rl.trainer import Extras, Trainer
 from pgdm.seeding import torch_stream
 from toy_envs import TOY_SAC, PointEnv, trainer_cfg
 
 SHORT = replace(TOY_SAC, steps_per_env=8, warmup_steps=8, batch_size=32)
-"""An iteration of 64 frames; it learns from the second one on."""
+"""64 frames an iteration; the first one is the warm-up."""
 D, A, M = 5, 2, 64
 
 
 class Lines(Callback):
-    """Notes the metrics of each iteration, times aside."""
+    """Records the metrics of each iteration except times."""
 
     def __init__(self) -> None:
         self.noted: list[dict[str, float]] = []
@@ -69,7 +70,7 @@ def test_sac_brings_the_point_to_the_origin() -> None:
     after = trainer.run().evaluation
     assert before is not None
     for kind in ("eval_sampled", "eval_deterministic"):
-        # Both are negative: from 1 a step, and out of the square, to a fourth of that.
+        # Both are negative; the distance to the origin falls to a third or less.
         assert after[f"{kind}/return"] > before[f"{kind}/return"] / 3
 
 
@@ -86,25 +87,28 @@ def test_the_same_seed_repeats_to_the_bit_whatever_the_global_stream() -> None:
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])
-def test_updates_beside_the_physics_change_no_bit(bfloat16: bool) -> None:
-    # Wide enough that torch really would split the products over its threads.
+def test_updates_during_the_physics_change_no_bit(
+    bfloat16: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"bf16": True})
+    # Wide enough for torch to split the products over its threads.
     cfg = replace(SHORT, hidden=[256, 256], bfloat16=bfloat16)
-    alone, beside = (trained(cfg, frames=256, threads=threads) for threads in (1, 2))
-    assert alone[1] == beside[1]
-    assert flat(alone[0].state_dict()) == flat(beside[0].state_dict())
+    alone, overlapping = (trained(cfg, frames=256, threads=threads) for threads in (1, 2))
+    assert alone[1] == overlapping[1]
+    assert flat(alone[0].state_dict()) == flat(overlapping[0].state_dict())
 
 
-def test_logged_numbers_and_when_they_begin() -> None:
+def test_logged_values_and_when_they_begin() -> None:
     _, noted = trained(frames=192)
     learned = {"train/loss_critic", "train/loss_policy", "train/entropy", "train/temperature"}
-    assert not learned & noted[0].keys()  # it only acts
+    assert not learned & noted[0].keys()  # acting only
     assert learned <= noted[1].keys()
     assert noted[1]["train/temperature"] == pytest.approx(TOY_SAC.temperature_init, rel=0.1)
     assert all(math.isfinite(value) for name, value in noted[2].items() if name in learned)
 
 
 @pytest.mark.parametrize(("actor_interval", "policies"), [(1, 12), (3, 4)])
-def test_so_many_updates_are_taken(actor_interval: int, policies: int) -> None:
+def test_the_number_of_updates(actor_interval: int, policies: int) -> None:
     env = PointEnv()
     cfg = replace(SHORT, updates_per_step=3, actor_interval=actor_interval, warmup_steps=2)
     learner = build(env, cfg)
@@ -121,17 +125,17 @@ def test_so_many_updates_are_taken(actor_interval: int, policies: int) -> None:
 
 
 @pytest.mark.parametrize("betas", [[0.9], [0.9, 1.0], [-0.1, 0.9], [0.9, 0.99, 0.999]])
-def test_decay_rates_that_adam_cannot_take_are_refused(betas: list[float]) -> None:
+def test_invalid_decay_rates_are_refused(betas: list[float]) -> None:
     with pytest.raises(ConfigError, match=r"^algo.adam_betas is \[.*such as \[0.9,0.99\]$"):
         Trainer(PointEnv(), trainer_cfg(replace(TOY_SAC, adam_betas=betas)))
 
 
-def test_the_replay_is_as_large_as_it_says(tmp_path: Path) -> None:
+def test_the_replay_has_the_announced_size(tmp_path: Path) -> None:
     env = PointEnv()
     cfg = trainer_cfg(SHORT, total_frames=100)  # 2 iterations of 64
     Trainer(env, cfg, Extras(replay_folder=tmp_path / "replay")).run()
     on_disk = sum(path.stat().st_size for path in (tmp_path / "replay").glob("*.bin"))
-    # 5 + 5 observations and 2 actions of 2 bytes, term and discount of 4, 1 byte of the end.
+    # 5 + 5 observations and 2 actions of 2 bytes, term and discount of 4, termination of 1.
     assert on_disk == SHORT.disk_bytes(env, env.num_envs, 100) == 128 * (2 * 12 + 2 * 4 + 1)
 
 
@@ -144,20 +148,24 @@ def build(env: PointEnv, cfg: SACCfg) -> SACLearner:
 
 def one_step(
     env: PointEnv, near: float = -1.0, terminated: bool = False, obs: Tensor | None = None
-) -> Step:
+) -> TensorDict:
     """Return a step of all simulations with a given reward before weighting."""
     n = env.num_envs
-    info = {
-        "final_obs": torch.zeros(n, D),
-        "raw_terms": {"near": torch.full((n,), near)},
+    step = {
+        "observation": torch.zeros(n, D) if obs is None else obs,
+        "action": torch.zeros(n, A),
+        "next": {
+            "observation": torch.zeros(n, D),
+            "terminated": torch.full((n, 1), terminated),
+            "truncated": torch.zeros(n, 1, dtype=torch.bool),
+            "raw_terms": {"near": torch.full((n,), near)},
+        },
     }
-    ends = torch.full((n,), terminated)
-    seen = torch.zeros(n, D) if obs is None else obs
-    return Step(seen, torch.zeros(n, A), ends, torch.zeros_like(ends), info)
+    return TensorDict(step, [n])
 
 
 def constant(learner: SACLearner, critics: list[float], targets: list[float]) -> None:
-    """Have each critic, and what it is steered to, answer one number."""
+    """Let each critic and each target critic return a constant."""
     state = copy.deepcopy(learner.state_dict())
     for prefix, values in (("qvalue", critics), ("target_qvalue", targets)):
         last = f"{prefix}_network_params.module.net.6"
@@ -170,22 +178,22 @@ def constant(learner: SACLearner, critics: list[float], targets: list[float]) ->
     ("terminated", "target"),
     [
         (True, 0.1 * -3.0),
-        # The lower of the critics' targets counts; the temperature is too small to.
+        # The lower of the two target critics counts; the temperature is negligible.
         (False, 0.1 * -3.0 + 0.5 * 4.0),
     ],
 )
-def test_what_the_critics_are_steered_to(terminated: bool, target: float) -> None:
+def test_the_critics_target(terminated: bool, target: float) -> None:
     env = PointEnv()
     cfg = replace(TOY_SAC, gamma=0.5, reward_scale=0.1, warmup_steps=1, temperature_init=1e-9)
     learner = build(env, cfg)
     learner.after_step(one_step(env, near=-3.0, terminated=terminated))
     constant(learner, critics=[1.0, 2.0], targets=[5.0, 4.0])
     learner.during_step()
-    logged = learner.learn(None)  # it looks at no rollout
+    logged = learner.learn(None)  # it does not use the rollout
     assert logged["loss_critic"] == pytest.approx((1 - target) ** 2 + (2 - target) ** 2, rel=1e-5)
 
 
-def test_targets_follow_by_their_share() -> None:
+def test_target_critics_move_by_the_target_rate() -> None:
     env = PointEnv()
     learner = build(env, replace(TOY_SAC, target_rate=0.25, warmup_steps=1))
     learner.after_step(one_step(env))
@@ -201,7 +209,7 @@ def flat_params(learner: SACLearner, prefix: str) -> Tensor:
     return torch.cat([v.flatten() for k, v in loss.items() if k.startswith(f"{prefix}_network")])
 
 
-def test_another_weight_holds_for_the_past_too() -> None:
+def test_a_changed_weight_applies_to_past_frames_too() -> None:
     env = PointEnv()
     learner = build(env, replace(TOY_SAC, reward_scale=0.5))
     for near in (-1.0, -2.0, -3.0):
@@ -215,7 +223,7 @@ def test_another_weight_holds_for_the_past_too() -> None:
     assert torch.equal(second, 4 * first)
 
 
-def test_observations_are_standardised_as_the_policys() -> None:
+def test_observations_are_standardised_as_for_the_policy() -> None:
     env = PointEnv()
     learner = build(env, TOY_SAC)
     obs = torch.arange(8.0)[:, None].expand(8, D).contiguous()
@@ -248,39 +256,41 @@ def test_a_loss_that_is_not_finite_is_named_and_changes_nothing() -> None:
     learner.after_step(one_step(env))
     before = learner.state_dict()
     env.set_weights({"near": math.inf})
-    with pytest.raises(RunError, match=r"^the loss of the critics is (inf|nan); .*is good") as told:
+    with pytest.raises(
+        RunError, match=r"^the loss of the critics is (inf|nan); .*is good"
+    ) as raised:
         learner.during_step()
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
     after = learner.state_dict()
     for part in ("model", "loss", "optimizers"):
         assert flat(after[part]) == flat(before[part])
 
 
-def test_a_step_that_was_cut_is_not_learned_from() -> None:
+def test_truncated_steps_are_not_learned_from() -> None:
     env = PointEnv()
     learner = build(env, SHORT)
     step = one_step(env)
-    step.truncated[2] = True
+    step["next", "truncated"][2] = True
     learner.after_step(step)
     assert len(learner._replay) == env.num_envs - 1
 
 
-def test_what_came_after_an_end_may_be_anything() -> None:
+def test_observations_after_a_termination_are_not_used() -> None:
     env = PointEnv()
     learner = build(env, replace(SHORT, warmup_steps=1))
     step = one_step(env)
-    step.terminated[:] = True
-    step.info["final_obs"] = torch.full((env.num_envs, D), math.nan)
+    step["next", "terminated"][:] = True
+    step["next", "observation"][:] = math.nan
     learner.after_step(step)
     learner.during_step()  # raises if it is used
 
 
-def test_a_weight_that_is_not_finite_is_told_before_anything_is_saved() -> None:
+def test_a_weight_that_is_not_finite_is_an_error_before_anything_is_saved() -> None:
     env = PointEnv()
     trainer = Trainer(env, trainer_cfg(SHORT))
+    rollout = trainer._collector.rollout()
     with torch.no_grad():
         next(trainer._learner.model.parameters()).fill_(math.nan)
-    rollout = Rollout.empty(1, env)
     with pytest.raises(RunError, match=r"a weight is not finite .*the last checkpoint is good"):
         trainer._learner.learn(rollout)
 
@@ -327,7 +337,7 @@ def batch_of(size: int) -> TensorDict:
 
 
 def still(policy: SquashedPolicy, mean: float, log_std: float) -> None:
-    """Have the policy answer one mean and deviation, before the squashing, everywhere."""
+    """Let the policy return a constant mean and deviation, before the squashing."""
     last = policy.net[-1]
     with torch.no_grad():
         last.weight.zero_()
@@ -354,10 +364,10 @@ def test_a_hand_worked_transition(ended: bool, discount: float | None) -> None:
     batch = batch_of(1)
     batch["next", "reward"] = torch.tensor([[0.7]])
     batch["next", "terminated"] = batch["next", "done"] = torch.tensor([[ended]])
-    if discount is not None:  # as the environment's soft end gives it
+    if discount is not None:  # as from the environment's soft end
         batch["next", "discount"] = torch.tensor([[discount]])
 
-    # The action that is drawn next is tanh(0.5 + z / e), of density
+    # The next action to be drawn is tanh(0.5 + z / e), of density
     # N(z) * e / (1 - tanh^2) in each of its entries.
     noise = torch.randn(1, A, generator=torch_stream(0, "policy")).double()
     action = torch.tanh(0.5 + math.exp(-1) * noise)
@@ -368,7 +378,7 @@ def test_a_hand_worked_transition(ended: bool, discount: float | None) -> None:
     got = float(loss.critic_loss(batch).detach())
     assert got == pytest.approx((2 - target) ** 2 + (3 - target) ** 2, rel=1e-4)
 
-    loss = sac_loss(policy, critics, temperature=0.3)  # its stream is at the start again
+    loss = sac_loss(policy, critics, temperature=0.3)  # restarts its stream
     got_policy, got_temperature, entropy = loss.policy_and_temperature_loss(batch)
     assert float(entropy) == pytest.approx(-log_prob, rel=1e-4)
     assert float(got_policy.detach()) == pytest.approx(0.3 * log_prob - 2.0, rel=1e-4)
@@ -377,7 +387,7 @@ def test_a_hand_worked_transition(ended: bool, discount: float | None) -> None:
     assert float(slope) == pytest.approx(-log_prob + 2.0, rel=1e-4)
 
 
-def test_the_entropy_target_falls_over_the_frames_seen() -> None:
+def test_the_target_entropy_falls_with_the_frames_seen() -> None:
     # From -1 to -3 nat an entry over 80 frames, 8 a step: after 2 steps -1.4, after 12 -3.
     cfg = replace(SHORT, warmup_steps=1, target_entropy=-1.0, target_entropy_end=-3.0)
     env = PointEnv()
@@ -389,8 +399,17 @@ def test_the_entropy_target_falls_over_the_frames_seen() -> None:
         assert float(learner._loss.target_entropy) == pytest.approx(expected * env.action_dim)
 
 
+@pytest.mark.parametrize(("has", "wanted"), [("avx2", False), ("amx_bf16", True), ("bf16", True)])
+def test_bfloat16_only_where_the_processor_has_it(
+    monkeypatch: pytest.MonkeyPatch, has: str, wanted: bool
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {has: True})
+    single, either = (trained(replace(SHORT, bfloat16=b), frames=192)[1] for b in (False, True))
+    assert (single != either) == wanted
+
+
 def test_values_are_not_rounded_by_bfloat16() -> None:
-    # Spaced by 0.06 around 12 in bfloat16, they would be a handful of numbers.
+    # bfloat16 values near 12 are 0.06 apart: only a handful would be distinct.
     critic = networks()[1][0]
     with torch.no_grad():
         critic.net[-1].bias.fill_(12.0)
@@ -401,11 +420,6 @@ def test_values_are_not_rounded_by_bfloat16() -> None:
 
 
 def test_equals_torchrls_own_loss() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from tensordict.nn import TensorDictModule
-        from torchrl.objectives import SACLoss
-
     policy, critics = networks()
     ours = sac_loss(policy, critics)
     theirs = SACLoss(
@@ -481,7 +495,7 @@ def test_actions_are_squashed() -> None:
     obs = torch.randn(1000, D, generator=torch_stream(0, "obs"))
     action, mean = policy.sample(obs, torch_stream(0, "actions"))
     assert float(action.abs().max()) <= 1
-    assert float(action[:, 0].min()) < -0.5  # and yet it spreads
+    assert float(action[:, 0].min()) < -0.5  # with noise
     assert float(mean.abs().max()) < 1
 
 
@@ -493,7 +507,7 @@ def test_a_sample_is_the_squashed_mean_and_noise() -> None:
     action, mean = policy.sample(obs, torch_stream(0, "actions"))
     torch.testing.assert_close(mean, torch.tanh(loc.detach()))
     torch.testing.assert_close(action, torch.tanh(loc + scale * noise).detach())
-    # It starts at the deviation it was given: exp(-1).
+    # The initial deviation is exp(-1).
     torch.testing.assert_close(scale, torch.full((3, A), math.exp(-1)), rtol=0.05, atol=0)
 
 
@@ -501,7 +515,7 @@ def test_it_starts_at_the_warm_start() -> None:
     obs = torch.randn(16, D, generator=torch_stream(0, "obs"))
     mean = squashed(torch.tensor([0.25, -0.5])).act(obs, deterministic=True)
     torch.testing.assert_close(mean, torch.tensor([0.25, -0.5]).expand(16, 2), rtol=0, atol=0.02)
-    # Where tanh is flat it would never come away again.
+    # Clipped, as it could not learn where tanh is flat.
     mean = squashed(torch.tensor([1.0, -3.0])).act(obs, deterministic=True)
     torch.testing.assert_close(mean, torch.tensor([0.95, -0.95]).expand(16, 2), rtol=0, atol=0.02)
 

@@ -9,14 +9,14 @@ import torch
 from pgdm.errors import CheckpointError, ConfigError, RunError
 from pgdm.mdp.schedules import Ramp
 from pgdm.rl.callback import Callback, Progress
-from pgdm.rl.checkpoint import CheckpointFolder
-from pgdm.rl.evaluate import Evaluator, load_policy
+from pgdm.rl.checkpoint import CheckpointFolder, read_checkpoint
+from pgdm.rl.evaluate import Evaluator, policy_of
 from pgdm.rl.trainer import Extras, Trainer
 from toy_envs import TOY, PointEnv, trainer_cfg
 
 
 class Record(Callback):
-    """Notes every moment and its numbers, times aside."""
+    """Records every event and its values except times."""
 
     def __init__(self) -> None:
         self.moments: list[tuple] = []
@@ -98,7 +98,7 @@ def test_evaluations_and_checkpoints_do_not_disturb_the_training(tmp_path: Path)
     assert_same(weights(bare), weights(busy))
 
 
-def test_moments_come_in_order(tmp_path: Path) -> None:
+def test_events_come_in_order(tmp_path: Path) -> None:
     record = Record()
     cfg = trainer_cfg(total_frames=1024, eval_interval_frames=512)
     extras = Extras(
@@ -168,13 +168,13 @@ def test_scheduled_weights_are_recorded_and_survive_a_resume_and_another_width(
     ramp = Ramp("near", 2.0, 1024)
 
     def weights(record: Record) -> list[tuple[int, float]]:
-        told = record.named("iteration")
-        return [(frames, metrics["train/weight/near"]) for _, frames, metrics in told]
+        iterations = record.named("iteration")
+        return [(frames, metrics["train/weight/near"]) for _, frames, metrics in iterations]
 
     cfg = trainer_cfg(total_frames=1536)
     straight, first, second, wide = Record(), Record(), Record(), Record()
     Trainer(PointEnv(), cfg, Extras(schedules=[ramp], callbacks=[straight])).run()
-    # Frames at an iteration's end; its weight is that of its start.
+    # Frames after an iteration, with the weight from its start.
     expected = [(256, 0.0), (512, 0.5), (768, 1.0), (1024, 1.5), (1280, 2.0), (1536, 2.0)]
     assert weights(straight) == expected
 
@@ -190,7 +190,7 @@ def test_scheduled_weights_are_recorded_and_survive_a_resume_and_another_width(
     assert weights(first) + weights(second) == expected
     assert env.weights["near"] == 2.0
 
-    # Twice the simulations: half the iterations, and the same line over frames.
+    # Twice the simulations: half the iterations, on the same line over frames.
     Trainer(PointEnv(16), cfg, Extras(schedules=[ramp], callbacks=[wide])).run()
     assert weights(wide) == [(512, 0.0), (1024, 1.0), (1536, 2.0)]
 
@@ -212,7 +212,7 @@ def test_a_stop_saves_and_a_restored_training_equals_a_straight_one(tmp_path: Pa
     assert outcome.progress.iteration == 2
     state = folder.latest()
     assert state is not None
-    # Stopped before the evaluation that was due: it is done after the restart.
+    # Stopped before an evaluation that was due: done after the resume.
     assert (state["frames"], state["evaluated_at"]) == (512, 0)
 
     resumed = Trainer(
@@ -230,7 +230,7 @@ def test_a_stop_saves_and_a_restored_training_equals_a_straight_one(tmp_path: Pa
     assert record.named(*kinds) == straight_record.named(*kinds)
 
 
-def test_a_finished_training_can_be_made_longer(tmp_path: Path) -> None:
+def test_a_finished_training_can_be_extended(tmp_path: Path) -> None:
     straight = Trainer(PointEnv(), trainer_cfg(total_frames=1024))
     straight.run()
     folder = CheckpointFolder(tmp_path, 2)
@@ -241,10 +241,10 @@ def test_a_finished_training_can_be_made_longer(tmp_path: Path) -> None:
     assert_same(weights(longer), weights(straight))
 
 
-def test_a_time_limit_ends_a_training_with_what_it_has_all_attempts_together(
+def test_a_time_limit_finishes_a_training_early_summed_over_attempts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock = iter(range(10_000))  # each look at the clock is a second
+    clock = iter(range(10_000))  # each reading of the clock adds a second
     monkeypatch.setattr("pgdm.rl.trainer.time.monotonic", lambda: float(next(clock)))
     folder = CheckpointFolder(tmp_path, 2)
 
@@ -294,7 +294,7 @@ def test_the_best_policy_is_kept(tmp_path: Path) -> None:
     Trainer(PointEnv(), cfg, extras).run()
     best = [frames for _, frames, name in record.named("checkpoint") if name == "best.ckpt"]
     assert best == [0, 256, 512]
-    policy = load_policy(folder.best)
+    policy = policy_of(read_checkpoint(folder.best), folder.best)
     assert policy.cfg.hidden == TOY.hidden
 
 
@@ -316,7 +316,7 @@ def test_checkpoints_are_written_by_time(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_nan_ends_the_training_and_leaves_a_good_checkpoint(tmp_path: Path) -> None:
+def test_a_nan_fails_the_training_and_leaves_a_good_checkpoint(tmp_path: Path) -> None:
     record = Record()
     env = PointEnv()
     folder = CheckpointFolder(tmp_path, 2)
@@ -342,10 +342,10 @@ def test_a_checkpoint_of_another_network_is_refused() -> None:
         other.load_state_dict(state)
     same = Trainer(PointEnv(), trainer_cfg())
     del state["frames"]
-    with pytest.raises(CheckpointError, match="does not fit"):
+    with pytest.raises(CheckpointError, match="it is no state of a run"):
         same.load_state_dict(state)
 
 
-def test_uneven_minibatches_are_refused_at_construction() -> None:
+def test_minibatches_that_do_not_divide_are_refused_at_construction() -> None:
     with pytest.raises(ConfigError, match="does not divide"):
         Trainer(PointEnv(7), trainer_cfg())

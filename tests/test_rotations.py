@@ -1,4 +1,4 @@
-"""Laws of rotations, and numbers worked by hand."""
+"""Laws of rotations, and hand-computed numbers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_conjugate_undoes_and_matrix_agrees(a: tuple, v: tuple) -> None:
 
 @settings(deadline=None)
 @given(quaternions, quaternions)
-def test_angle_is_a_metric_blind_to_sign(a: tuple, b: tuple) -> None:
+def test_angle_is_symmetric_and_ignores_the_sign_of_quaternions(a: tuple, b: tuple) -> None:
     p, q = unit(a), unit(b)
     assert abs(rot.angle(p, q) - rot.angle(q, p)) < 1e-9
     assert abs(rot.angle(p, q) - rot.angle(-p, q)) < 1e-9
@@ -48,7 +48,7 @@ def test_angle_is_a_metric_blind_to_sign(a: tuple, b: tuple) -> None:
     assert rot.angle(p, p) < 1e-7
 
 
-def test_quarter_turn_by_hand() -> None:
+def test_a_quarter_turn_about_z() -> None:
     q = torch.tensor([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])  # 90 degrees about z
     torch.testing.assert_close(rot.rotate(q, torch.tensor([1.0, 0, 0])), torch.tensor([0, 1.0, 0]))
     assert abs(rot.angle(q, torch.tensor([1.0, 0, 0, 0])) - math.pi / 2) < 1e-6
@@ -61,7 +61,7 @@ def test_euler_round_trip(values: tuple) -> None:
     torch.testing.assert_close(rot.to_euler_xyz(rot.from_euler_xyz(angles)), angles)
 
 
-def test_unwrap_by_hand() -> None:
+def test_unwrap_removes_jumps() -> None:
     wrapped = torch.tensor([3.0, -3.0, -2.0, 3.1])[:, None]
     tau = 2 * math.pi
     expected = torch.tensor([3.0, tau - 3.0, tau - 2.0, 3.1])[:, None]

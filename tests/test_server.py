@@ -25,9 +25,10 @@ import pytest
 from command_line import TINY, command, process
 from fake_runs import STEP, end, make, train_metrics, truth
 from pgdm.cli.dashboard import HOST, free_port
-from pgdm.tracking import RunFolder, RunLog, TrackingCfg, open_tracker
+from pgdm.runs.folder import RunFolder, find_runs
+from pgdm.runs.log import RunLog
+from pgdm.tracking import TrackingCfg, open_tracker
 from pgdm.tracking.mlflow import PARENT_TAG, Mirror, Store
-from pgdm.tracking.run_folder import find_runs
 from pgdm.tracking.sync import history, sync
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "server.md").read_text(encoding="utf-8")
@@ -253,7 +254,7 @@ def test_the_server_is_killed_and_comes_back(
     finally:
         server.start()
     assert run.returncode == 0, err
-    assert "training goes on" in err and "pgdm runs sync" in err
+    assert "training continues" in err and "pgdm runs sync" in err
     expected = truth(RunFolder(folder.path))
     each = "train/steps_per_s"
     assert len(shown(store, folder)[each]) < len(expected[each]) == 500

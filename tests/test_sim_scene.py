@@ -1,4 +1,4 @@
-"""Where a massless body's centre of mass is, and what objects weigh."""
+"""Centre of mass of massless bodies, and masses of objects."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ import numpy as np
 import pytest
 
 from command_line import TINY, command
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.envs.build import EnvBuilder
 from pgdm.errors import RunError
 from pgdm.experiment import check_assets, env_builder
 from pgdm.library import open_library
-from pgdm.library.author_drop import drop
-from pgdm.library.check import compile_tracked, compiled
+from pgdm.library.authored.drop import drop
+from pgdm.library.checks.compiled import compile_tracked, compiled
 from pgdm.library.published_masses import RATIOS
 from pgdm.sim import scene as scenes
-from pgdm.sim.scene import Scene, scale_mass
+from pgdm.sim.assembly import scale_mass
+from pgdm.sim.scene import Scene
 
 STUDY = Path(__file__).resolve().parents[1] / "benchmark" / "results" / "study" / "runs"
 
@@ -51,7 +52,7 @@ def scene(*overrides: str) -> Scene:
 
 @pytest.fixture
 def older() -> Iterator[pytest.MonkeyPatch]:
-    """Compile scenes as earlier versions did, until it is undone."""
+    """Compile scenes as earlier versions did, until undone."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scenes, "compile_tracked", lambda spec, body: spec.compile())
         yield patch
@@ -62,15 +63,15 @@ def test_the_com_of_a_massless_tracked_body_is_its_origin() -> None:
     assert model.body("mark").ipos == pytest.approx(np.zeros(3), abs=0)
     assert model.body("mark").iquat == pytest.approx([1, 0, 0, 0], abs=0)
     assert model.body_mass.tolist() == pytest.approx([0, 4 / 3 * np.pi * 0.1**3 * 1000, 0, 0])
-    # The geom is where it was, and so is the box in which collisions look for it.
+    # The geom is where it was, and so is its bounding box for collision detection.
     assert model.geom("bump").pos == pytest.approx([0.1, 0.2, 0.3])
     boxes = model.bvh_aabb[model.body_bvhadr[model.body("mark").id]]
     assert boxes == pytest.approx([0.1, 0.2, 0.3, 0.02, 0.02, 0.02])
-    # A body that is not looked at stays as MuJoCo has it.
+    # An untracked body stays as MuJoCo has it.
     assert model.body("other").ipos == pytest.approx([0.4, 0.5, 0.6])
 
 
-def test_a_com_that_is_given_or_weighed_stays() -> None:
+def test_a_given_or_computed_com_is_kept() -> None:
     assert made(MARKED.format(INERTIAL), "mark").body("mark").ipos == pytest.approx([0.3, 0, 0])
     plain = mujoco.MjModel.from_xml_string(MARKED.format(""))
     for tracked in ("object", "nobody"):
@@ -78,14 +79,14 @@ def test_a_com_that_is_given_or_weighed_stays() -> None:
         assert np.array_equal(model.body_ipos, plain.body_ipos)
 
 
-def test_objects_that_are_compiled_alone_have_the_same_com(tmp_path: Path) -> None:
+def test_objects_compiled_alone_have_the_same_com(tmp_path: Path) -> None:
     path = tmp_path / "object.xml"
     path.write_text(
         '<mujoco><worldbody><body name="arm"><joint axis="0 0 1"/><geom size=".1"/>'
         '<body name="object" pos=".1 0 0"/></body></worldbody></mujoco>'
     )
     assert compiled(path, "mark").body("object").ipos == pytest.approx(np.zeros(3), abs=0)
-    # Six joints, and all of the mass in a part of it: a ball whose centre is 30 cm to the side.
+    # Six joints, and all of its mass in one part.
     joints = "".join(
         f'<joint type="{kind}" axis="{axis}"/>'
         for kind in ("slide", "hinge")
@@ -114,35 +115,35 @@ def test_the_door_starts_at_its_first_target() -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_start_far_from_the_first_target_is_told_with_both_points(
+def test_a_start_far_from_the_first_target_is_reported_with_both_points(
     older: pytest.MonkeyPatch,
 ) -> None:
     (note,) = builder("task=door-open").notes
     assert note.startswith("the object of door-open starts 21 cm from its first target: ")
     older.undo()
     x, y, z = builder("task=door-open").make(1, 1).sim.read().object_pos[0].tolist()
-    told = [float(x) for x in re.findall(r"-?\d\.\d{3}", note)]
-    # MuJoCo's point lies 15 cm to either side of the origin, with the door nearly closed.
-    assert told[:3] == pytest.approx([x + 0.15, y - 0.15, z], abs=2e-3)
-    assert told[3:] == pytest.approx(builder("task=door-open").mdp.reference.pos[0], abs=5e-4)
+    reported = [float(x) for x in re.findall(r"-?\d\.\d{3}", note)]
+    # MuJoCo's point lies 15 cm from the origin along x and y, with the door nearly closed.
+    assert reported[:3] == pytest.approx([x + 0.15, y - 0.15, z], abs=2e-3)
+    assert reported[3:] == pytest.approx(builder("task=door-open").mdp.reference.pos[0], abs=5e-4)
 
 
 @pytest.mark.usefixtures("library_home")
-def test_runs_of_the_older_scene_are_told_apart(older: pytest.MonkeyPatch) -> None:
+def test_runs_of_the_older_scene_are_distinguished(older: pytest.MonkeyPatch) -> None:
     stored = json.loads((STUDY / "pgdm-residual" / "door-open" / "result.json").read_text())
-    # All that the older scene had is as it was, but for the tracked body.
+    # Only the tracked body has changed since the older scene.
     assert scene("task=door-open").digest() == stored["scene_sha256"]
     older.undo()
     now = builder("task=door-open")
     (difference,) = now.differences(stored)
     assert difference.startswith(f"scene_sha256 '{stored['scene_sha256']}', and the library now")
     assert "the tracked body door/object is massless: its centre of mass is now its" in difference
-    with pytest.raises(RunError, match=r"was made with scene_sha256 .* in another run_dir"):
+    with pytest.raises(RunError, match=r"was trained with scene_sha256 .* in another run_dir"):
         check_assets(stored, now, Path("run"), print)
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_run_of_the_older_scene_does_not_go_on(older: pytest.MonkeyPatch) -> None:
+def test_a_run_of_the_older_scene_is_not_resumed(older: pytest.MonkeyPatch) -> None:
     arguments = ("--offline", *TINY, "task=door-open", "run_dir=run")
     assert command("pgdm-run", *arguments).code == 0
     older.undo()
@@ -159,7 +160,7 @@ def test_a_run_of_the_older_scene_does_not_go_on(older: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("mark", ["", "<body name='mark' pos='1 0 0'/>"])
-def test_scaled_masses_are_those_of_a_model_of_such_bodies(mark: str) -> None:
+def test_scaled_masses_equal_those_of_a_model_with_such_bodies(mark: str) -> None:
     spec = mujoco.MjSpec.from_string(WEIGHED.format(1000, 1, 0.02, mark))
     scale_mass(spec, 0.5)
     model = compile_tracked(spec, "mark")
@@ -175,13 +176,13 @@ def test_scaled_masses_are_those_of_a_model_of_such_bodies(mark: str) -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_published_masses_are_those_of_the_objects_alone() -> None:
+def test_published_masses_change_the_objects_only() -> None:
     volume = scene("task=spheremedium-lift")
     published = scene("task=spheremedium-lift", "sim.object_mass=published")
     ratio = np.ones(volume.model.nbody)
     ratio[volume.index.object_body] = 0.8923
     assert published.model.body_mass == pytest.approx(ratio * volume.model.body_mass)
-    # 0.30422 kg in the MuJoCo of then, 0.34096 kg in 4.0.
+    # 0.30422 kg in the MuJoCo of the paper's time, 0.34096 kg in 4.0.
     assert published.model.body_mass[volume.index.object_body] == pytest.approx(0.30422, rel=2e-4)
     assert published.digest() != volume.digest()
 
@@ -201,5 +202,5 @@ def test_an_object_without_a_published_mass_is_named(monkeypatch: pytest.MonkeyP
     assert builder().notes == []
     unknown = builder("sim.object_mass=published")
     (note,) = unknown.notes
-    assert "the published mass of hammer is not known; the mass by volume stays" in note
+    assert "the published mass of hammer is not known; keeping the mass by volume" in note
     assert unknown.scene.model.body("hammer/object").mass == mass

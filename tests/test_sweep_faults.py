@@ -1,4 +1,4 @@
-"""Whatever is killed, full or locked: the same command again ends with each job done once."""
+"""After any process is killed, disk full or ledger locked, the same command completes each job."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
+from pgdm.runs.files import read_json
+from pgdm.runs.log import RunLog
 from pgdm.sweep.ledger import FILE, Ledger
 from pgdm.sweep.plan import write_plan
 from pgdm.sweep.queue import Queue
-from pgdm.sweep.state import rows, works
-from pgdm.tracking.run_folder import read_json
-from pgdm.tracking.run_log import RunLog
+from pgdm.sweep.status import rows, works
 from sweep_plans import plan, start
 
 JOBS, FAULTS = 4, 20

@@ -166,7 +166,7 @@ def test_a_full_disk_loses_nothing(disk: Path) -> None:
         while True:
             file.write(b"0" * 4096)
     big = Ending("finished", 0, 32, {f"metric {i}": 0.1 for i in range(5000)}, None)
-    with pytest.raises(SweepError, match="make room and start the same command again"):
+    with pytest.raises(SweepError, match="make room and run the same command again"):
         ledger.end(key, number, big)
     assert ledger.attempts()[0].state == "running"
     ballast.unlink()

@@ -14,12 +14,13 @@ import pytest
 
 from command_line import command
 from pgdm.errors import SweepError
+from pgdm.runs.files import read_json
+from pgdm.runs.folder import claimed
+from pgdm.runs.log import RunLog
 from pgdm.sweep.launch import held
 from pgdm.sweep.ledger import Ledger
 from pgdm.sweep.plan import Plan, read_plan, write_plan
-from pgdm.sweep.state import log_path, parent, rows
-from pgdm.tracking.run_folder import claimed, read_json
-from pgdm.tracking.run_log import RunLog
+from pgdm.sweep.status import log_path, parent, rows
 from sweep_plans import broken, plan, start
 
 LONG = ("total_frames=1600", "eval.interval_frames=0", "checkpoint.interval_s=0.5")
@@ -81,8 +82,8 @@ def test_one_fails_the_others_finish_and_the_same_again_does_only_the_rest(folde
     # A ledger that was lost comes back from the run folders.
     before = [(row.state, row.frames, row.success) for row in rows(ledger)]
     ledger.path.unlink()
-    told = json.loads(command("pgdm", "sweep", "status", str(folder), "--json").out)
-    after = [(job["state"], job["frames"], job["success"]) for job in told["jobs"]]
+    status = json.loads(command("pgdm", "sweep", "status", str(folder), "--json").out)
+    after = [(job["state"], job["frames"], job["success"]) for job in status["jobs"]]
     assert after == [before[0], ("waiting", 0, None), before[2]]
 
 
@@ -124,7 +125,7 @@ def test_the_driver_is_killed_and_its_workers_save(folder: Path) -> None:
     workers = [a.process for a in ledger.attempts()]
     process.kill()
     process.communicate()
-    again = start(folder)  # at once: the workers are still there
+    again = start(folder)  # immediately: the workers still run
     _, err = again.communicate(timeout=300)
     assert again.returncode == 0, err
     assert not any(worker.alive for worker in workers)

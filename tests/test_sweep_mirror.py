@@ -15,13 +15,14 @@ import pytest
 from command_line import command
 from fake_runs import empty_database, end, make, train
 from pgdm.config.saved import save_config
+from pgdm.runs.files import LINK, read_json, write_json
+from pgdm.runs.folder import PARENT, RunFolder
 from pgdm.sweep.ledger import Ending, Ledger
 from pgdm.sweep.mirror import SweepMirror
 from pgdm.sweep.plan import Plan, write_plan
 from pgdm.sweep.processes import Process
-from pgdm.tracking import RunFolder, TrackingCfg, open_tracker
+from pgdm.tracking import TrackingCfg, open_tracker
 from pgdm.tracking.mlflow import Store, store_uri
-from pgdm.tracking.run_folder import LINK, PARENT, read_json, write_json
 from pgdm.tracking.sync import sync
 from sweep_plans import plan, start
 
@@ -35,7 +36,7 @@ MIRRORED = ("tracking=mlflow", "tracking.experiment=other")
 
 @pytest.fixture
 def whole(tmp_path: Path, empty_database: Path) -> Plan:
-    """Return a planned sweep of two jobs, with an empty database beside it."""
+    """Return a planned sweep of two jobs, with an empty database in its folder."""
     made = plan(tmp_path / "study", 2, *MIRRORED)
     write_plan(made)
     shutil.copy(empty_database, made.folder / "mlflow.db")
@@ -59,7 +60,7 @@ def runs(folder: Path) -> dict[str, tuple[str, str | None]]:
     }
 
 
-def tell(text: str) -> None:
+def unexpected(text: str) -> None:
     raise AssertionError(text)
 
 
@@ -69,19 +70,19 @@ def test_a_sweep_is_one_run_however_often_it_is_opened(whole: Plan, tmp_path: Pa
         ("failed", "FAILED"),
         ("finished", "FINISHED"),
     ):
-        mirror = SweepMirror.of(whole, tell)
+        mirror = SweepMirror.of(whole, unexpected)
         mirror.open(whole)
         assert runs(whole.folder) == {"study": ("RUNNING", None)}
         assert read_json(whole.folder / LINK)["status"] == "running"
         mirror.close(status)
         assert runs(whole.folder) == {"study": (shown, None)}
     (whole.folder / LINK).unlink()
-    SweepMirror.of(whole, tell).open(whole)
+    SweepMirror.of(whole, unexpected).open(whole)
     assert len(runs(whole.folder)) == 1
 
 
 def test_jobs_are_shown_below_it(whole: Plan, tmp_path: Path) -> None:
-    mirror = SweepMirror.of(whole, tell)
+    mirror = SweepMirror.of(whole, unexpected)
     mirror.open(whole)
     folder = make(whole.folder / "runs" / "s0")
     mirror.adopt(whole.jobs[0])
@@ -89,7 +90,7 @@ def test_jobs_are_shown_below_it(whole: Plan, tmp_path: Path) -> None:
     train(folder)
     end(folder)
     tracker.finish("finished")
-    # In the sweep's store, though by itself the run would go to one beside its own folder.
+    # In the sweep's store; without a sweep, the run would use one next to its own folder.
     assert runs(whole.folder) == {"study": ("RUNNING", None), "s0": ("FINISHED", "study")}
     assert not (whole.folder / "runs" / "mlflow.db").exists()
 
@@ -98,14 +99,14 @@ def test_jobs_are_shown_below_it(whole: Plan, tmp_path: Path) -> None:
     ("status", "shown", "named"),
     [
         ("interrupted", "KILLED", True),
-        ("interrupted", "KILLED", False),  # killed before its folder said which run is its own
+        ("interrupted", "KILLED", False),  # killed before its folder recorded its MLflow run
         ("finished", "FINISHED", True),
     ],
 )
 def test_a_killed_job_gets_its_true_status(
     whole: Plan, tmp_path: Path, status: str, shown: str, named: bool
 ) -> None:
-    mirror = SweepMirror.of(whole, tell)
+    mirror = SweepMirror.of(whole, unexpected)
     mirror.open(whole)
     folder = make(whole.folder / "runs" / "s0", tracking={"experiment": "other"})
     (folder.path / ".lock").touch()
@@ -131,7 +132,7 @@ def test_a_killed_job_gets_its_true_status(
 
 
 def test_a_job_that_was_killed_before_mlflow_heard_of_it_is_shown(whole: Plan) -> None:
-    mirror = SweepMirror.of(whole, tell)
+    mirror = SweepMirror.of(whole, unexpected)
     mirror.open(whole)
     folder = make(whole.folder / "runs" / "s0", tracking={"experiment": "other"})
     train(folder)
@@ -144,7 +145,7 @@ def test_a_job_that_was_killed_before_mlflow_heard_of_it_is_shown(whole: Plan) -
 
 
 def test_status_tells_mlflow_that_a_sweep_was_killed(whole: Plan, tmp_path: Path) -> None:
-    SweepMirror.of(whole, tell).open(whole)
+    SweepMirror.of(whole, unexpected).open(whole)
     ledger = Ledger(whole.folder)
     ledger.add(whole)
     (tmp_path / "runs").mkdir()
@@ -153,7 +154,7 @@ def test_status_tells_mlflow_that_a_sweep_was_killed(whole: Plan, tmp_path: Path
     for expected, way in ways.items():
         assert command("pgdm", *way).code == 0
         assert runs(whole.folder) == {"study": (expected, None)}
-        SweepMirror.of(whole, tell).open(whole)
+        SweepMirror.of(whole, unexpected).open(whole)
         for key in ledger.states():
             number = ledger.begin(key, Process.of(os.getpid()))
             ledger.end(key, number, Ending("finished", 0, 32, {}, None))
@@ -161,7 +162,7 @@ def test_status_tells_mlflow_that_a_sweep_was_killed(whole: Plan, tmp_path: Path
 
 
 def test_a_job_that_outlives_its_sweep_and_is_killed_then(whole: Plan) -> None:
-    mirror = SweepMirror.of(whole, tell)
+    mirror = SweepMirror.of(whole, unexpected)
     mirror.open(whole)
     ledger = Ledger(whole.folder)
     ledger.add(whole)
@@ -169,7 +170,7 @@ def test_a_job_that_outlives_its_sweep_and_is_killed_then(whole: Plan) -> None:
     (folder.path / ".lock").touch()
     mirror.adopt(whole.jobs[0])
     tracker = open_tracker(TrackingCfg("mlflow", None, "other"), folder, {})
-    tracker._pool.shutdown()  # type: ignore[attr-defined] # what it began is done: the run is there
+    tracker._pool.shutdown()  # type: ignore[attr-defined] # what it began is done
     name, status = folder.path.name, ("sweep", "status", str(whole.folder))
     worker = subprocess.Popen(["sleep", "60"])
     try:
@@ -193,7 +194,7 @@ def test_mlflow_out_of_reach_stops_nothing(whole: Plan) -> None:
     mirror.open(dataclasses.replace(whole, jobs=jobs))
     mirror.correct(Path(cfg.run_dir))
     mirror.close("finished")
-    assert len(heard) == 1 and uri in heard[0] and "the sweep goes on" in heard[0]
+    assert len(heard) == 1 and uri in heard[0] and "the sweep continues" in heard[0]
 
 
 def test_mlflow_that_was_away_at_the_start_has_all_in_the_end(
@@ -214,16 +215,16 @@ def test_mlflow_that_was_away_at_the_start_has_all_in_the_end(
     folder = make(whole.folder / "runs" / "s0", tracking=dataclasses.asdict(tracking))
     train(folder)
     end(folder)
-    assert len(heard) == 1 and "the sweep goes on" in heard[0]
+    assert len(heard) == 1 and "the sweep continues" in heard[0]
     place.unlink()
     place.mkdir()
     shutil.copy(empty_database, place / "mlflow.db")
-    sync(whole.folder)
+    sync(whole.folder, store_uri(place))
     assert runs(place) == {"s0": ("FINISHED", None)}
     mirror.close("finished")
-    assert [done.action for done in sync(whole.folder)] == ["completed"]
+    assert [done.action for done in sync(whole.folder, store_uri(place))] == ["completed"]
     assert runs(place) == {"study": ("FINISHED", None), "s0": ("FINISHED", "study")}
-    assert [done.action for done in sync(whole.folder)] == ["unchanged"]
+    assert [done.action for done in sync(whole.folder, store_uri(place))] == ["unchanged"]
     assert len(heard) == 1
 
 
@@ -240,7 +241,7 @@ def test_kills_leave_no_run_twice_and_none_running(library_home: Path, tmp_path:
             attempt.process.signal(signal.SIGKILL)  # at first this may be the driver itself
         sweep.kill()
         sweep.communicate()
-        # A worker that had only just been started is in no ledger; it ends by itself.
+        # A worker that was just started may be in no ledger; it exits without help.
         limit = time.monotonic() + 60
         while True:
             assert command("pgdm", "sweep", "status", str(whole.folder)).code == 0

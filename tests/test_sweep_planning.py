@@ -9,19 +9,20 @@ import pytest
 
 from fake_runs import STEP, make, train
 from fake_runs import end as end_run
-from pgdm.config.store import _composed as composed_settings
+from pgdm.config.compose import compose_plain
 from pgdm.errors import ConfigError, SweepError
 from pgdm.sweep.estimate import estimate
-from pgdm.sweep.plan import FILE, Plan, SweepCfg, check_fits, job_key, read_plan, record
+from pgdm.sweep.plan import Plan, SweepCfg, check_fits, job_key, read_job, read_plan, record
 from pgdm.sweep.planning import make_plan
+from pgdm.sweep.status import PLAN
 
-CFG = SweepCfg(name=None, dir=None, max_attempts=3, detach=False, dry_run=False)
+CFG = SweepCfg(name=None, dir=None, max_attempts=3, detach=False, dry_run=False, most_jobs=10_000)
 SMALL = ("total_frames=40960",)
 
 
 def planned(*jobs: tuple[str, ...], name: str = "mine", **changes: object) -> Plan:
     """Plan jobs given by their overrides."""
-    composed = [(job, composed_settings([*SMALL, *job])) for job in jobs]
+    composed = [(job, compose_plain([*SMALL, *job])) for job in jobs]
     return make_plan(composed, dataclasses.replace(CFG, **changes), name, "pgdm-run -m ...")[0]
 
 
@@ -63,18 +64,18 @@ def test_keys_follow_from_what_changes_the_result() -> None:
 
 def test_what_would_be_done_twice_is_left_out_and_told() -> None:
     typed = (("seed=0",), ("seed=1",), ("seed=0", "num_threads=1"))
-    jobs = [(overrides, composed_settings(overrides)) for overrides in typed]
+    jobs = [(overrides, compose_plain(overrides)) for overrides in typed]
     plan, notes = make_plan(jobs, CFG, "mine", "")
     assert len(plan.jobs) == 2
-    assert notes == ["'seed=0 num_threads=1' would repeat 'seed=0', and is left out"]
+    assert notes == ["'seed=0 num_threads=1' repeats 'seed=0', and is left out"]
 
 
 @pytest.mark.parametrize(
     ("changes", "jobs", "message"),
     [
-        ({"name": "a/b"}, [()], "sweep.name 'a/b' is no name for a folder"),
-        ({"name": ".."}, [()], "sweep.name '..' is no name"),
-        ({"name": ""}, [()], "sweep.name '' is no name"),
+        ({"name": "a/b"}, [()], "sweep.name 'a/b' is not valid"),
+        ({"name": ".."}, [()], "sweep.name '..' is not valid"),
+        ({"name": ""}, [()], "sweep.name '' is not valid"),
         ({"max_attempts": 0}, [()], "sweep.max_attempts is 0; it must be at least 1"),
         ({}, [("seed=0", "run_dir=a"), ("seed=1", "run_dir=a")], "would share run_dir '.*a'"),
         ({}, [("seed=0",), ("seed=-1",)], r"seed is -1.*in the run task=hammer-use1 seed=-1; none"),
@@ -110,7 +111,7 @@ def test_a_plan_is_read_as_it_was_written(tmp_path: Path) -> None:
 def test_a_plan_older_than_a_key_is_read_and_its_jobs_are_the_same() -> None:
     plan = planned(("seed=0",), ("seed=1",))
     record(plan)
-    file = plan.folder / FILE
+    file = plan.folder / PLAN
     whole = json.loads(file.read_text())
     for job in whole["jobs"]:
         del job["config"]["sim"]["object_mass"]
@@ -136,15 +137,15 @@ def test_settings_beside_the_result_may_change() -> None:
 
 def test_changed_settings_are_refused_with_what_differs() -> None:
     record(planned(("seed=0",), ("seed=1",)))
-    before = (planned(()).folder / FILE).read_bytes()
+    before = (planned(()).folder / PLAN).read_bytes()
     changed = planned(("seed=0", "algo.clip=0.1"), ("seed=1", "algo.clip=0.1"))
     with pytest.raises(SweepError) as caught:
         record(changed)
     message = str(caught.value)
     assert message.startswith("sweep 'mine' in '")
-    assert "(task=hammer-use1 seed=0: algo.clip: 0.2 -> 0.1; 1 more differ too)" in message
-    assert message.endswith("choose another sweep.name, or the settings it was made with")
-    assert (planned(()).folder / FILE).read_bytes() == before
+    assert "(task=hammer-use1 seed=0: algo.clip: 0.2 -> 0.1; 1 more jobs differ too)" in message
+    assert message.endswith("choose another sweep.name, or the settings it was planned with")
+    assert (planned(()).folder / PLAN).read_bytes() == before
     with pytest.raises(SweepError, match="total_frames: 40960 -> 81920"):
         check_fits(planned(("seed=0", "total_frames=81920")))
 
@@ -152,7 +153,7 @@ def test_changed_settings_are_refused_with_what_differs() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda whole: whole | {"format": 9}, "has a format of another pgdm"),
+        (lambda whole: whole | {"format": 9}, "has the format of another pgdm"),
         (lambda whole: {}, "is damaged"),
         (lambda whole: [], "is damaged"),
         (lambda whole: whole | {"jobs": [{"key": "a"}]}, "is damaged"),
@@ -162,8 +163,8 @@ def test_changed_settings_are_refused_with_what_differs() -> None:
 def test_a_damaged_plan(change: Callable[[dict], object], message: str) -> None:
     plan = planned(())
     record(plan)
-    whole = json.loads((plan.folder / FILE).read_text())
-    (plan.folder / FILE).write_text(json.dumps(change(whole)))
+    whole = json.loads((plan.folder / PLAN).read_text())
+    (plan.folder / PLAN).write_text(json.dumps(change(whole)))
     with pytest.raises(SweepError, match=message):
         record(plan)
 
@@ -172,6 +173,20 @@ def _without_seed(whole: dict) -> dict:
     job = whole["jobs"][0]
     config = {key: value for key, value in job["config"].items() if key != "seed"}
     return {**job, "config": config}
+
+
+def test_a_worker_reads_its_own_job_only() -> None:
+    plan = planned(("seed=0",), ("seed=1",))
+    record(plan)
+    file = plan.folder / PLAN
+    whole = json.loads(file.read_text())
+    del whole["jobs"][0]["config"]["seed"]  # damaged, but not read
+    file.write_text(json.dumps(whole))
+    assert read_job(plan.folder, plan.jobs[1].key) == plan.jobs[1]
+    with pytest.raises(SweepError, match="missing seed"):
+        read_plan(plan.folder)
+    with pytest.raises(SweepError, match="has no job 0123; run the sweep's command again"):
+        read_job(plan.folder, "0123")
 
 
 def test_no_sweep_here(tmp_path: Path) -> None:

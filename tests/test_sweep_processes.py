@@ -19,7 +19,7 @@ def test_a_process_is_alive_until_it_ends() -> None:
         assert known.alive and known.here
         assert known.signal(signal.SIGKILL)
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        assert not known.alive  # nobody has asked for its exit code yet
+        assert not known.alive  # its exit code has not been read yet
     assert not known.alive
     assert not known.signal(signal.SIGTERM)
     assert Process.of(process.pid).born == ""

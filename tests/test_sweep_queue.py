@@ -1,4 +1,4 @@
-"""What is asked of Slurm, and what is read from its answers; without a Slurm."""
+"""Commands for Slurm, and the parsing of its answers, without a Slurm."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pgdm.sweep.ledger import Ledger
 from pgdm.sweep.processes import Process
 from pgdm.sweep.queue import Queue, Standing, parse
 from pgdm.sweep.slurm import parameters
-from pgdm.sweep.state import rows, settle
+from pgdm.sweep.status import rows, settle
 from sweep_plans import SLURM, plan
 
 # As Slurm 22.05 prints it, but for the spaces between the columns.

@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from pgdm.cli.console.sweep_table import failures, live_table, span, summary_line
+from pgdm.memory import free_bytes
+from pgdm.runs.log import RunLog
 from pgdm.sweep.ledger import Ending, Ledger
-from pgdm.sweep.local import Room, free_memory_gb, room
+from pgdm.sweep.local import Room, room
 from pgdm.sweep.processes import Process
-from pgdm.sweep.state import PARENT, Row, log_path, parent, rows, settle, stand, summarize
-from pgdm.sweep.view import failures, live_table, span, summary_line
-from pgdm.tracking.run_log import RunLog
+from pgdm.sweep.status import PARENT, Row, log_path, parent, rows, run_ending, settle, summarize
 from sweep_plans import LOCAL, plan
 
 
@@ -39,26 +40,28 @@ def result(run_dir: Path, status: str, frames: int, **more: object) -> None:
 
 def test_how_a_run_stands(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    assert stand(run, 32) == Ending("interrupted", None, 0, {}, None)
+    assert run_ending(run, 32) == Ending("interrupted", None, 0, {}, None)
     record(run, 0, "eval", **{"eval_sampled/success": 0.1})
     record(run, 16, **{"train/success": 0.2})
-    assert stand(run, 32) == Ending("interrupted", None, 16, {"eval_sampled/success": 0.1}, None)
+    assert run_ending(run, 32) == Ending(
+        "interrupted", None, 16, {"eval_sampled/success": 0.1}, None
+    )
     success = {"eval_sampled/success": 0.25}
     result(run, "failed", 16, error="no room")
-    assert stand(run, 32) == Ending("failed", None, 16, success, "no room")
+    assert run_ending(run, 32) == Ending("failed", None, 16, success, "no room")
     result(run, "finished", 32)
-    assert stand(run, 32) == Ending("finished", None, 32, success, None)
-    assert stand(run, 64).state == "interrupted"  # it was a shorter run
+    assert run_ending(run, 32) == Ending("finished", None, 32, success, None)
+    assert run_ending(run, 64).state == "interrupted"  # it was a shorter run
 
 
 def test_a_run_that_its_limit_of_time_ended_is_finished(tmp_path: Path) -> None:
     result(tmp_path, "finished", 16, ended_by="time_limit", wall_time_s=61.0)
-    assert stand(tmp_path, 32).state == "finished"  # under the limit that it had
-    assert stand(tmp_path, 32, 1.0).state == "finished"
-    for limit_min in (2.0, None):  # it may go on now
-        assert stand(tmp_path, 32, limit_min).state == "interrupted"
+    assert run_ending(tmp_path, 32).state == "finished"  # under the limit that it had
+    assert run_ending(tmp_path, 32, 1.0).state == "finished"
+    for limit_min in (2.0, None):  # now it may continue
+        assert run_ending(tmp_path, 32, limit_min).state == "interrupted"
     result(tmp_path, "finished", 16, ended_by="frames", wall_time_s=61.0)
-    assert stand(tmp_path, 32, 1.0).state == "interrupted"  # it was a shorter run
+    assert run_ending(tmp_path, 32, 1.0).state == "interrupted"  # it was a shorter run
 
 
 def test_running_is_believed_only_of_the_living(tmp_path: Path) -> None:
@@ -185,9 +188,9 @@ def test_logs_have_names_that_any_disk_takes(tmp_path: Path) -> None:
         (0, 0, 0, 16, 5, Room(5, 3)),  # by memory, the cores divided
         (0, 0, 0, 16, 64, Room(6, 2)),  # no more than jobs
         (0, 4, 0, 16, 64, Room(4, 4)),
-        (0, 0, 8, 16, 64, Room(2, 8)),  # the jobs themselves say how many
+        (0, 0, 8, 16, 64, Room(2, 8)),  # the jobs set their threads themselves
         (3, 0, 0, 16, 64, Room(3, 5)),
-        (3, 2, 0, 1, 64, Room(3, 2)),  # who says how many gets them
+        (3, 2, 0, 1, 64, Room(3, 2)),  # explicit numbers win
         (0, 0, 0, 1, 0.5, Room(1, 1)),
     ],
 )
@@ -202,4 +205,4 @@ def test_how_jobs_share_a_machine(
 ) -> None:
     launcher = type(LOCAL)("local", max_jobs, cores_per_job, 1.0)
     assert room(plan(tmp_path, 6, f"num_threads={threads}"), launcher, cores, memory_gb) == expected
-    assert 0.01 < free_memory_gb() < 10_000
+    assert 1e7 < free_bytes() < 1e13

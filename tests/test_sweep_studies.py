@@ -53,7 +53,7 @@ def test_a_file_in_your_own_folder(tmp_path: Path) -> None:
         (["+sweep=validate"], "unknown sweep file 'validate'; did you mean validate_tcdm50"),
         (["+sweep=none.yaml"], "unknown sweep file 'none.yaml'"),
         (["sweep=sim2real"], r"with a plus: \+sweep=sim2real"),
-        (["+sweep=sim2real", "+sweep=sim2real"], "is there 2 times; start one"),
+        (["+sweep=sim2real", "+sweep=sim2real"], "is given 2 times; start one"),
     ],
 )
 def test_wrong_names(overrides: list[str], message: str) -> None:
@@ -65,8 +65,8 @@ def test_wrong_names(overrides: list[str], message: str) -> None:
     ("text", "message"),
     [
         ("task: [a\n", "not valid YAML"),
-        ("- task\n", "holds no sweep; write lines such as task: tcdm30"),
-        ("", "holds no sweep"),
+        ("- task\n", "is no sweep file; write lines such as task: tcdm30"),
+        ("", "is no sweep file"),
         ("algo: {clip: 0.1}\n", "write nested keys in one line"),
     ],
 )

@@ -1,45 +1,43 @@
 """Pre-grasps cut from demonstrations, in the task's real scene.
 
-``PGDM_DAPG_DEMOS`` names DAPG's pickle of the door; without it those tests skip that need it.
+``PGDM_DAPG_DEMOS`` names DAPG's pickle of the door; tests that need it are skipped without it.
 """
 
 from __future__ import annotations
 
 import os
 import pickle
-from functools import cache
 from pathlib import Path
 
 import h5py
-import mujoco
 import numpy as np
 import pytest
 
 from command_line import command
-from pgdm.config.store import compose
+from pgdm.config.compose import compose
 from pgdm.errors import ConfigError, CorruptAssetError, PgdmError, UnknownNameError
-from pgdm.library import open_library, pregrasp_file
-from pgdm.pregrasp import demonstrations, teleop
-from pgdm.pregrasp.demonstrations import Demonstration
+from pgdm.library import open_library
+from pgdm.library.files import pregrasp as pregrasp_file
+from pgdm.pregrasp.hand_geometry import posed
+from pgdm.pregrasp.teleop import cut as teleop
+from pgdm.pregrasp.teleop import demonstrations
+from pgdm.pregrasp.teleop.demonstrations import Demonstration
 from pgdm.sim.contact import HandContact
-from pgdm.sim.scene import Scene, build_scene
+from pgdm.sim.scene import Scene
+from task_scenes import opened
 
 DEMOS = os.environ.get("PGDM_DAPG_DEMOS")
 DEMOS = str(Path(DEMOS).absolute()) if DEMOS else None
 DOOR = slice(29, 32), slice(32, 35)  # of an observation: palm, handle
 
 
-@cache
 def scene() -> Scene:
-    cfg = compose(["task=door-open"])
-    return build_scene(open_library(), cfg.task, cfg.hand, cfg.sim)
+    return opened("door-open")[0]
 
 
 def observed(qpos: np.ndarray, door_m: np.ndarray) -> np.ndarray:
-    """Return what AdroitHandDoor observes (39,) of a state whose door stands elsewhere."""
-    data = mujoco.MjData(scene().model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(scene().model, data)
+    """Return AdroitHandDoor's observation (39,) of a state, the door displaced by a vector (3,)."""
+    data = posed(scene(), qpos)
     palm, handle = data.site("adroit/S_grasp").xpos, data.site("door/S_handle").xpos
     row = np.zeros(39)
     row[:27], row[27], row[28] = qpos[3:30], qpos[31], qpos[30]
@@ -49,7 +47,7 @@ def observed(qpos: np.ndarray, door_m: np.ndarray) -> np.ndarray:
 
 
 def approach(door_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Demonstration:
-    """Return a demonstration: the published pre-grasp from 20 cm off, then on through the door."""
+    """Return a demonstration: from 20 cm away to the published pre-grasp, and through the door."""
     mined = open_library().motion("door-open").starts["mined"].qpos
     rows = []
     for back in np.concatenate((np.linspace(0.2, 0.0, 21), np.linspace(-0.01, -0.1, 10))):
@@ -64,9 +62,9 @@ def objects() -> np.ndarray:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_hand_is_put_where_it_was_wherever_the_door_stood() -> None:
+def test_a_hand_is_placed_relative_to_the_door() -> None:
     mined = open_library().motion("door-open").starts["mined"].qpos
-    # The demonstrations' hand has one slide, along y: it is as far off as its door.
+    # The demonstrations' hand has one slide, along y, and is displaced like its door.
     for door in ((0.0, 0.0, 0.0), (0.0, -0.05, 0.0)):
         made = teleop.replay(scene(), approach(door))
         np.testing.assert_allclose(made.qpos[20], mined, atol=1e-6)
@@ -79,26 +77,26 @@ def test_a_hand_is_put_where_it_was_wherever_the_door_stood() -> None:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_brush_in_passing_is_no_hold() -> None:
+def test_a_short_contact_is_no_hold() -> None:
     rows = approach().observations
     brush = np.concatenate((rows[:15], rows[-2:], rows[:15], rows[-9:]))
     made = teleop.replay(scene(), Demonstration(0, brush))
     assert made.touching[15:17].all()
     assert made.hold is not None and made.hold >= 32
-    with pytest.raises(ConfigError, match="touches nothing"):
+    with pytest.raises(ConfigError, match="never touches anything"):
         calm = teleop.replay(scene(), Demonstration(0, rows[:10]))
         teleop.cut(scene(), calm, objects(), "test")
-    with pytest.raises(ConfigError, match="from the first step on"):
+    with pytest.raises(ConfigError, match="already holds something in the first step"):
         held = teleop.replay(scene(), Demonstration(0, rows[-6:]))
         teleop.cut(scene(), held, objects(), "test")
 
 
 @pytest.mark.usefixtures("library_home")
-def test_what_cannot_be_followed_is_said() -> None:
+def test_demonstrations_that_cannot_be_followed_are_refused() -> None:
     low = approach().observations.copy()
     low[:, DOOR[1]] -= [0.0, 0.0, 0.15]
     far = teleop.replay(scene(), Demonstration(0, low))
-    with pytest.raises(ConfigError, match=r"15 cm from the task's.*beyond their ranges"):
+    with pytest.raises(ConfigError, match=r"15 cm from the task's.*exceed their ranges"):
         teleop.cut(scene(), far, objects(), "test")
     with pytest.raises(ConfigError, match="none of 1 demonstrations"):
         teleop.nearest([far])
@@ -113,7 +111,7 @@ def test_what_cannot_be_followed_is_said() -> None:
 
 
 def minari(path: Path, episodes: list[np.ndarray]) -> Path:
-    """Write episodes as Minari stores them: T + 1 observations, T of all else."""
+    """Write episodes as Minari stores them: T + 1 observations, T of everything else."""
     path.parent.mkdir(parents=True)
     with h5py.File(path, "w", track_order=True) as file:
         for i, observations in enumerate(episodes):
@@ -131,9 +129,9 @@ def minari(path: Path, episodes: list[np.ndarray]) -> Path:
 
 
 @pytest.mark.usefixtures("library_home")
-def test_a_minari_dataset_gives_what_its_episodes_hold(tmp_path: Path) -> None:
+def test_a_minari_dataset_is_read_in_the_order_of_its_numbers(tmp_path: Path) -> None:
     near, far = (approach(door).observations for door in ((0, 0, 0), (0, 0.05, 0)))
-    # Ten or more: names sort as text, numbers do not.
+    # More than ten: names sort as text, which is not the order of the numbers.
     file = minari(tmp_path / "human-v2" / "data" / "main_data.hdf5", [far] * 10 + [near])
     for path in (file, tmp_path / "human-v2"):
         found = demonstrations.read(path)
@@ -147,13 +145,13 @@ def test_a_minari_dataset_gives_what_its_episodes_hold(tmp_path: Path) -> None:
 
 def test_damaged_files_are_named(tmp_path: Path) -> None:
     cases: dict[str, tuple[bytes, str]] = {
-        "a.hdf5": (b"no hdf5", "no readable HDF5"),
+        "a.hdf5": (b"no hdf5", "not readable as HDF5"),
         "a.pickle": (pickle.dumps(Path("x")), "pickle asks for"),
-        "b.pickle": (pickle.dumps({"a": 1}), "no list of demonstrations"),
+        "b.pickle": (pickle.dumps({"a": 1}), "is not a list of demonstrations"),
         "c.pickle": (pickle.dumps([{"actions": np.zeros((2, 2))}]), "lacks 'observations'"),
-        "d.pickle": (pickle.dumps([]), "holds no demonstrations"),
+        "d.pickle": (pickle.dumps([]), "contains no demonstrations"),
         "e.pickle": (pickle.dumps([{"observations": np.full((2, 39), np.nan)}]), "NaN"),
-        "f.txt": (b"", "ending of f.txt"),
+        "f.txt": (b"", "extension of f.txt"),
     }
     for name, (content, message) in cases.items():
         (tmp_path / name).write_bytes(content)
@@ -175,7 +173,7 @@ def test_the_published_pregrasp_of_the_door_is_in_the_demonstrations() -> None:
     mined = open_library().motion("door-open").starts["mined"].qpos
     replays = [teleop.replay(scene(), one) for one in found]
     assert max(made.palm_error_m for made in replays) < 0.009
-    # Demonstration 0, step 70, to 8 mm and 8 mrad: its own cut is four steps later.
+    # Demonstration 0, step 70, within 8 mm and 8 mrad: ours is cut four steps later.
     first = teleop.nearest(replays)
     assert first.number == 0 and first.shift_m < 1e-3
     assert np.abs(first.qpos[:, :30] - mined[:30]).max(axis=1).argmin() == 70

@@ -24,9 +24,11 @@ from fake_runs import (
     train_metrics,
 )
 from pgdm.errors import UnknownNameError
-from pgdm.tracking import NullTracker, RunFolder, Tracker, TrackingCfg, metric_names, open_tracker
+from pgdm.runs.config_file import as_text, dotted
+from pgdm.runs.files import LINK, read_json
+from pgdm.runs.folder import RunFolder
+from pgdm.tracking import NullTracker, Tracker, TrackingCfg, metric_names, open_tracker
 from pgdm.tracking.mlflow import Mirror, Store, find_run, store_uri
-from pgdm.tracking.run_folder import LINK, flatten, read_json
 from pgdm.tracking.thin import MAX_POINTS, Thin, points
 
 __all__ = ["empty_database"]  # a fixture
@@ -110,8 +112,8 @@ def test_a_run_as_mlflow_shows_it(tmp_path: Path) -> None:
     assert run.data.tags["mlflow.source.git.commit"] == "0123abc"
     assert tags["git"] == "0123abc"  # from the result; unknown at the start
     assert "| `com_error` | m |" in run.data.tags["mlflow.note.content"]
-    params = flatten({k: v for k, v in config().items() if k not in ("run_dir", "resume")})
-    assert run.data.params == params
+    params = dotted({k: v for k, v in config().items() if k not in ("run_dir", "resume")})
+    assert run.data.params == {name: as_text(value) for name, value in params.items()}
     assert steps(store, link["run_id"], "train/return") == [
         (i * STEP, 10.0 * i) for i in range(1, LENGTH + 1)
     ]
@@ -232,7 +234,7 @@ def test_store_out_of_reach_warns_once_and_harms_nobody(
         tracker.finish("finished")
     messages = [r.getMessage() for r in caplog.records if r.name.startswith("pgdm")]
     assert len(messages) == 2
-    assert uri in messages[0] and "training goes on" in messages[0]
+    assert uri in messages[0] and "training continues" in messages[0]
     assert "pgdm runs sync" in messages[1]
     assert "\n" not in "".join(messages)
 
@@ -295,7 +297,7 @@ tracker.finish("finished")
 
 
 def test_four_processes_start_at_once_without_a_database(tmp_path: Path) -> None:
-    env = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", PROGRAM]
     jobs = [
         subprocess.Popen([*command, str(i)], env=env, stderr=subprocess.PIPE, text=True)

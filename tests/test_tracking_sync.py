@@ -14,9 +14,10 @@ from filelock import FileLock
 
 from fake_runs import LENGTH, STEP, empty_database, end, eval_metrics, make, train, truth
 from pgdm.errors import TrackingError
-from pgdm.tracking import RunFolder, TrackingCfg, open_tracker
+from pgdm.runs.files import LINK, read_json
+from pgdm.runs.folder import RunFolder
+from pgdm.tracking import TrackingCfg, open_tracker
 from pgdm.tracking.mlflow import Store, store_uri
-from pgdm.tracking.run_folder import LINK, read_json
 from pgdm.tracking.sync import sync
 
 __all__ = ["empty_database"]  # a fixture
@@ -165,6 +166,11 @@ def test_store_that_cannot_be_used_is_one_line(root: Path) -> None:
     with pytest.raises(TrackingError) as error:
         sync(root, uri="http://127.0.0.1:9")
     assert "\n" not in str(error.value)
+    (root / "notes.txt").write_text("milk, bread, and more than a hundred characters " * 9)
+    with pytest.raises(TrackingError, match=r"notes\.txt: file is not a database"):
+        sync(root, uri=f"sqlite:///{root}/notes.txt")
+    with pytest.raises(TrackingError, match="No such file or directory: '/proc"):
+        sync(root, uri="sqlite:////proc/version")
 
 
 def test_deleted_database_comes_back(root: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from wrist import grasp_errors
 
 from pgdm import rotations
 from pgdm.motion.reference import ObjectReference
@@ -102,3 +103,12 @@ def test_the_start_is_where_the_hand_is() -> None:
     index, ref = tiny_index(), smooth_motion(3, 0.2)
     start = double([0.1, -0.2, 0.3, 0.4, -0.5, 0.6, 0, 0])
     torch.testing.assert_close(feasible_path(index, ref, start)[0], start[:6], atol=1e-6, rtol=0)
+
+
+def test_the_grasp_point_is_off_by_what_a_slide_is() -> None:
+    index, ref = tiny_index(), smooth_motion(0, 0.1)
+    start = double([0.1, -0.2, 0.3, 0.1, -0.1, 0.2, 0, 0])
+    path = carried_path(index, ref, start).numpy()
+    path[1:, 0] += 0.1
+    errors = grasp_errors(index, ref, start.numpy(), path)
+    np.testing.assert_allclose(errors, [0.0, *[0.1] * (len(path) - 1)], atol=1e-12)

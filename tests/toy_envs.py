@@ -1,12 +1,14 @@
-"""Small environments that a policy learns in seconds, and settings to match."""
+"""Small environments that a policy learns in seconds, and matching settings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Self
 
 import torch
+import yaml
 from torch import Tensor
 
 from pgdm.rl.learner import AlgoCfg
@@ -15,55 +17,24 @@ from pgdm.rl.sac import SACCfg
 from pgdm.rl.trainer import TrainerCfg
 from pgdm.seeding import torch_stream
 
-PAPER = PPOCfg(
-    learner="ppo",
-    name="ppo",
-    gamma=0.95,
-    gae_lambda=0.95,
-    learning_rate=1e-5,
-    adam_eps=1e-5,
-    value_coef=0.5,
-    entropy_coef=0.001,
-    clip=0.2,
-    steps_per_env=128,
-    minibatch_size=256,
-    epochs=5,
-    normalize_advantage=True,
-    max_grad_norm=0.5,
-    hidden=[256, 128],
-    log_std_init=-1.6,
-    warm_start=True,
-    normalize_observations=False,
-    observation_clip=10.0,
-)
-
+ALGO = Path(__file__).resolve().parents[1] / "conf" / "algo"
+PAPER = PPOCfg(**yaml.safe_load((ALGO / "ppo.yaml").read_text(encoding="utf-8")))
 TOY = replace(
     PAPER, learning_rate=1e-3, steps_per_env=32, minibatch_size=64, hidden=[32, 32], log_std_init=-1
 )
-
-
-TOY_SAC = SACCfg(
-    learner="sac",
-    name="sac",
-    gamma=0.95,
+TOY_SAC = replace(
+    SACCfg(**yaml.safe_load((ALGO / "sac.yaml").read_text(encoding="utf-8"))["algo"]),
     learning_rate=3e-3,
     steps_per_env=32,
     hidden=[32, 32],
     log_std_init=-1.0,
-    warm_start=True,
-    observation_clip=10.0,
     reward_scale=1.0,
-    adam_betas=[0.9, 0.99],
-    critics=2,
     target_rate=0.02,
     batch_size=64,
     updates_per_step=1,
-    actor_interval=2,
-    target_entropy=-1.0,
     target_entropy_end=-1.0,
     target_entropy_frames=1000,
     temperature_init=0.05,
-    warmup_steps=16,
     bfloat16=False,
 )
 
@@ -97,15 +68,15 @@ class Ended:
 
 
 class PointEnv:
-    """A point in the plane that should be pushed to the origin, with bits of randomness.
+    """A point in the plane that should be pushed to the origin from a random start.
 
-    Terminates after 20 steps, is cut (truncated) when it leaves the square of half-width 2.
+    Terminates after 20 steps; truncated when it leaves the square of half-width 2.
     """
 
     obs_dim, action_dim = 5, 2
 
     def __init__(self, num_envs: int = 8, seed: int = 0, scale: float = 1.0) -> None:
-        self.num_envs, self._scale = num_envs, scale
+        self.num_envs, self.device, self._scale = num_envs, torch.device("cpu"), scale
         self._generator = torch_stream(seed, "point")
         self._t = torch.zeros(num_envs, dtype=torch.int64)
         self._return = torch.zeros(num_envs)
@@ -174,7 +145,7 @@ class PointEnv:
 
 
 class ScriptedEnv:
-    """Replays given rewards and ends; the observation is the step's number, per simulation.
+    """Replays given rewards, terminations and truncations; the observation is the step count.
 
     Args:
         reward: (T, N).
@@ -193,6 +164,7 @@ class ScriptedEnv:
         action_dim: int = 1,
     ) -> None:
         self.num_envs, self.obs_dim, self.action_dim = reward.shape[1], obs_dim, action_dim
+        self.device = reward.device
         never = torch.zeros(reward.shape, dtype=torch.bool)
         self._reward = reward
         self._terminated = never if terminated is None else terminated
@@ -207,10 +179,9 @@ class ScriptedEnv:
         t, self.t = self.t, self.t + 1
         final = self._obs()
         done = self._terminated[t] | self._truncated[t]
-        obs = torch.where(done[:, None], -final, final)  # after a restart: the negative
+        obs = torch.where(done[:, None], -final, final)  # negative after a reset
         terms = {"script": self._reward[t]}
-        info = {"final_obs": final, "terms": terms, "raw_terms": terms}
-        info["episodes"] = None
+        info = {"final_obs": final, "terms": terms, "raw_terms": terms, "episodes": None}
         return obs, self._reward[t], self._terminated[t], self._truncated[t], info
 
     def _obs(self) -> Tensor:
@@ -233,7 +204,7 @@ class ScriptedEnv:
 
 
 class FreeEnv(ScriptedEnv):
-    """Costs nothing to step: for measuring what learning itself costs."""
+    """An environment that steps in no time, for measuring the cost of learning itself."""
 
     def __init__(self, num_envs: int = 32, obs_dim: int = 322, action_dim: int = 30) -> None:
         super().__init__(torch.zeros(1, num_envs), obs_dim=obs_dim, action_dim=action_dim)
@@ -250,6 +221,5 @@ class FreeEnv(ScriptedEnv):
         obs = self._obs()
         reward = self._rewards[self.t % 16]
         terms = {"script": reward}
-        info = {"final_obs": obs, "terms": terms, "raw_terms": terms}
-        info["episodes"] = None
+        info = {"final_obs": obs, "terms": terms, "raw_terms": terms, "episodes": None}
         return obs, reward, self._no, self._no, info

@@ -1,8 +1,8 @@
-"""Finds where the animated tasks start: ``python tools/animated_starts.py [TASK...]``.
+"""Compute the start states of the animated tasks: ``python tools/animated_starts.py [TASK...]``.
 
-For each file in src/pgdm/library/keyframes: the object is put on the table and settles, the hand is
-searched near it, contact-free (pgdm.pregrasp.near), and both joint numbers are written into the
-file as ``start``. Needs a library with hands and objects. Prints what it found, and draws it.
+For each file in src/pgdm/library/keyframes: the object settles on the table, a contact-free hand
+pose is searched near it (pgdm.pregrasp.near), and both joint positions are written into the file as
+``start``. Needs a library with hands and objects. Prints and draws the result.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ from pgdm.author import TaskRequest
 from pgdm.author.motion import MotionRequest, make_motion
 from pgdm.author.pregrasp import make_pregrasp
 from pgdm.author.task import AuthoredTask, task_scene
-from pgdm.cli.author_task import film_panels
+from pgdm.cli.author.task import film_panels
 from pgdm.library import animated, open_library
+from pgdm.library.checks.motion import object_joints
 from pgdm.library.manifest import TaskEntry
-from pgdm.library.motion_checks import object_joints
+from pgdm.library.progress import silent
 from pgdm.sim.sheet import write_sheet
 
 DIGITS = 4
 
 
 def find(task: str, pictures: Path) -> None:
-    """Write a task's start into its file."""
+    """Write a task's start state into its file."""
     path = animated.FOLDER / f"{task}.yaml"
     text = path.read_text(encoding="utf-8").split("# Where hand and object start")[0].rstrip()
     content = yaml.safe_load(text)
@@ -39,15 +40,15 @@ def find(task: str, pictures: Path) -> None:
         keyframes = Path(folder) / f"{task}.yaml"
         keyframes.write_text(yaml.safe_dump(content), encoding="utf-8")
         motion = MotionRequest(keyframes, None)
-        request = TaskRequest(task, name, hand, motion)
+        request = TaskRequest(f"{task}-start", name, hand, motion)  # pgdm has the task already
         library = open_library()
         entry = TaskEntry(hand, [name], 0, ["mined"])
-        scene = task_scene(request, library.promising(task, entry))
+        scene = task_scene(request, library.promising(request.id, entry))
         body = scene.index.object_body
         made = make_motion(motion, library.object_xml(name), scene.model, body)
     qpos = np.zeros(scene.model.nq)
     qpos[scene.model.nu :] = object_joints(scene.model, body, made.poses)[0]
-    found = make_pregrasp(request.pregrasp, scene, qpos, made.poses, library, lambda *_: None)
+    found = make_pregrasp(request.pregrasp, scene, qpos, made.poses, library, silent)
     print(task, *made.notes, *found.notes, sep="\n  ")
     nu = scene.model.nu
     start = {"hand": found.qpos[:nu], "object": found.qpos[nu:]}
@@ -55,7 +56,7 @@ def find(task: str, pictures: Path) -> None:
     wrapped = re.sub(r"(.{60,92}?,) ", r"\1\n    ", "\n".join(lines))
     comment = "# Where hand and object start [m, rad]; found by tools/animated_starts.py."
     path.write_text(f"{text}\n{comment}\nstart:\n{wrapped}\n", encoding="utf-8")
-    author = AuthoredTask(task, scene, made, found, path, path)
+    author = AuthoredTask(task, scene, made, found, None, path, path)
     write_sheet(scene, film_panels(author), pictures / f"{task}.png")
 
 

@@ -1,4 +1,4 @@
-"""Make the README's picture, three moments of a film, from the video that `make run` names.
+"""Write the README's picture, three moments of the video whose path `make run` prints.
 
 python tools/readme_picture.py runs/.../videos/frames_000000524288.mp4
 """
@@ -13,12 +13,12 @@ import numpy as np
 from PIL import Image
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "quickstart.jpg"
-MOMENTS = (0.05, 0.45, 0.85)  # shares of the film
+MOMENTS = (0.05, 0.45, 0.85)  # shares of the video
 WIDTH = 400  # of each, pixels
 
 
 def frames(video: Path) -> list[Image.Image]:
-    """Return the pictures of a film."""
+    """Return the frames of a video."""
     reader = imageio_ffmpeg.read_frames(str(video))
     width, height = next(reader)["size"]
     shape = (height, width, 3)
@@ -27,8 +27,8 @@ def frames(video: Path) -> list[Image.Image]:
 
 def main(video: Path) -> None:
     """Write the picture."""
-    film = frames(video)
-    chosen = [film[int(share * len(film))] for share in MOMENTS]
+    pictures = frames(video)
+    chosen = [pictures[int(share * len(pictures))] for share in MOMENTS]
     height = WIDTH * chosen[0].height // chosen[0].width
     strip = Image.new("RGB", (WIDTH * len(chosen), height))
     for i, picture in enumerate(chosen):

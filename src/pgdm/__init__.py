@@ -1,7 +1,8 @@
 """Pre-Grasp informed Dexterous Manipulation.
 
-``pgdm.make_batch`` and ``pgdm.make_torchrl`` make environments; in Gymnasium they are called
-``pgdm/<task>-v0``. Commands: ``pgdm-run`` trains, ``pgdm`` does the rest.
+``pgdm.make_batch``, ``pgdm.make_torchrl`` and ``pgdm.make_sb3`` make environments; in Gymnasium
+they are called ``pgdm/<task>-v0``. ``pgdm.load_policy`` reads the policy of a run. Commands:
+``pgdm-run`` trains, ``pgdm`` does the rest.
 """
 
 from __future__ import annotations
@@ -9,15 +10,21 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pgdm.make import register
+from pgdm.moved import keep_old_names
 
 if TYPE_CHECKING:
-    from pgdm.make import make_batch, make_torchrl
+    from pgdm.make import make_batch, make_sb3, make_torchrl
+    from pgdm.runs.checkpoints import load_policy
 
-__all__ = ["make_batch", "make_torchrl"]
+__all__ = ["load_policy", "make_batch", "make_sb3", "make_torchrl"]
 
 
 def __getattr__(name: str) -> object:
     # torch and the simulator load when an environment is asked for, not with every `import pgdm`.
+    if name == "load_policy":
+        from pgdm.runs.checkpoints import load_policy
+
+        return load_policy
     if name in __all__:
         from pgdm import make
 
@@ -27,3 +34,4 @@ def __getattr__(name: str) -> object:
 
 # Gymnasium finds environments of packages that were imported; it asks for nothing by itself.
 register()
+keep_old_names()

@@ -1,4 +1,12 @@
-"""The cross-entropy method: a Gaussian that narrows around the best of its samples."""
+"""The cross-entropy method: a diagonal Gaussian that narrows around its best samples.
+
+A round draws x_i ~ N(m, diag(s^2)), takes the ``elites`` samples of least cost, and sets
+
+    m <- k m + (1 - k) mean(elites)
+    s <- max(k s + (1 - k) std(elites), least s_0) + added s_0
+
+with ``k`` the smoothing and ``s_0`` the first standard deviation.
+"""
 
 from __future__ import annotations
 
@@ -9,28 +17,29 @@ import numpy as np
 
 @dataclass(frozen=True)
 class CemCfg:
-    """How a Gaussian follows its samples."""
+    """How the Gaussian follows its samples."""
 
     population: int
-    """Samples of a round."""
+    """Samples per round."""
     elites: int
-    """Of them, how many the next ones are drawn around."""
+    """Samples of a round that the next round is drawn around."""
     smoothing: float = 0.0
-    """Share of the old mean and deviation that a round keeps (0..1)."""
+    """Share of the old mean and standard deviation that a round keeps (0..1)."""
     least: float = 0.0
-    """Share of the first deviation below which none falls, so that the search does not freeze."""
+    """Lower bound of the standard deviation, as a share of the first one: keeps the search from
+    freezing."""
     added: float = 0.0
-    """Share of the first deviation that is added to the elites', for the same reason."""
+    """Share of the first standard deviation added to that of the elites, for the same reason."""
 
 
 class CrossEntropy:
     """A search for the vector of least cost.
 
     Args:
-        mean: of the first samples (D,).
-        std: their deviation (D,).
+        mean: mean of the first samples (D,).
+        std: their standard deviation (D,).
         cfg: how to search.
-        random: where the samples come from.
+        random: source of the samples.
     """
 
     def __init__(
@@ -46,9 +55,9 @@ class CrossEntropy:
         return self.mean + self.std * noise
 
     def tell(self, samples: np.ndarray, cost: np.ndarray) -> np.ndarray:
-        """Learn what samples (N, D) cost (N,); return the rows of the elites, best first.
+        """Move to the best of samples (N, D) with costs (N,); return the elites' rows, best first.
 
-        Samples of infinite cost are no elites, however few there are.
+        Samples of infinite cost are never elites, even if fewer than ``elites`` remain.
         """
         elites = np.argsort(cost, kind="stable")[: self._cfg.elites]
         elites = elites[np.isfinite(cost[elites])]

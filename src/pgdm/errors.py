@@ -1,34 +1,44 @@
-"""Errors that people meet. Every message names the wrong value and what would be right."""
+"""Errors shown to users. Every message names the wrong value and what would be right."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import sys
+from collections.abc import Collection, Iterable, Sequence
+from numbers import Integral
 
-_FEW = 12  # names that are all shown
+_FEW = 12  # up to this many valid names are all listed
 
 
 class PgdmError(Exception):
-    """Base of all errors that pgdm raises on purpose; commands print it as one line."""
+    """Base of all errors that pgdm raises deliberately; commands print them as one line."""
 
 
 class ConfigError(PgdmError):
-    """A setting has a wrong name, type or value."""
+    """A setting has an invalid name, type or value."""
 
 
 class UnknownNameError(ConfigError):
-    """A task, hand, key... that does not exist.
+    """A task, hand, key or other name does not exist.
 
     Args:
-        kind: what was asked for, such as ``"task"``.
+        kind: what the name stands for, such as ``"task"``.
         name: the name that was not found.
         valid: the names that exist.
-        hint: one more sentence, such as the command that helps.
+        hint: an additional sentence, such as a command that helps.
+        meant: names that are meant, if known; empty: those that look alike.
     """
 
-    def __init__(self, kind: str, name: str, valid: Iterable[str], hint: str = "") -> None:
+    def __init__(
+        self,
+        kind: str,
+        name: str,
+        valid: Iterable[str],
+        hint: str = "",
+        meant: Sequence[str] = (),
+    ) -> None:
         names = sorted(valid)
-        close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.5)
+        close = meant or difflib.get_close_matches(str(name), names, n=3, cutoff=0.5)
         shown = names if len(names) <= _FEW else [*names[:_FEW], f"... ({len(names)} in all)"]
         message = f"unknown {kind} '{name}'"
         if close:
@@ -39,28 +49,82 @@ class UnknownNameError(ConfigError):
         self.name, self.valid = name, names
 
 
+def check_at_least(key: str, value: float, low: float) -> None:
+    """Check a number of the settings.
+
+    Raises:
+        ConfigError: if it is less than ``low``.
+    """
+    if value < low:
+        raise ConfigError(f"{key} is {value}; it must be at least {low}")
+
+
+def check_count(key: str, value: object, low: int) -> None:
+    """Check a whole number that a caller from Python has given.
+
+    Raises:
+        ConfigError: if it is no whole number, or less than ``low``.
+    """
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise ConfigError(f"{key} is {value!r}; it must be a whole number, {low} or more")
+    check_at_least(key, int(value), low)
+
+
+def check_above_zero(key: str, value: float) -> None:
+    """Check a number of the settings.
+
+    Raises:
+        ConfigError: if it is 0 or less.
+    """
+    if value <= 0:
+        raise ConfigError(f"{key} is {value}; it must be above 0")
+
+
+def check_name(kind: str, name: str, valid: Collection[str]) -> None:
+    """Check a name, see :class:`UnknownNameError`.
+
+    Raises:
+        UnknownNameError: if it is not among the valid ones.
+    """
+    if name not in valid:
+        raise UnknownNameError(kind, name, valid)
+
+
+def check_interpreter() -> None:
+    """Check that Python keeps docstrings, without which torchrl cannot be imported.
+
+    Raises:
+        ConfigError: if it runs with ``-OO``.
+    """
+    if sys.flags.optimize > 1:
+        raise ConfigError(
+            "Python runs with -OO or PYTHONOPTIMIZE=2, and torchrl cannot be imported then; "
+            "run it without"
+        )
+
+
+class LimitError(PgdmError):
+    """Work on a file takes more time or memory than it may."""
+
+
 class LibraryError(PgdmError):
-    """The asset library lacks something or could not be changed."""
+    """The asset library lacks an asset or could not be changed."""
 
 
 class CorruptAssetError(LibraryError):
-    """An asset file is damaged or holds values that cannot be right; names file and reason."""
-
-
-class PlanMissingError(LibraryError):
-    """A wrist plan is not made yet, where it may not be made."""
+    """An asset file is damaged or has impossible values; the message names file and reason."""
 
 
 class UnsafePickleError(CorruptAssetError):
-    """A pickled object asks for more than arrays, dicts, lists, strings and numbers."""
+    """A pickle contains more than arrays, dicts, lists, strings and numbers."""
 
 
 class SceneError(PgdmError):
-    """A scene cannot be compiled, or lacks a body, joint or geom by name."""
+    """A scene does not compile, or lacks a named body, joint or geom."""
 
 
 class RenderError(PgdmError):
-    """No picture could be made, usually because no OpenGL was found."""
+    """An image or video could not be rendered or written, usually for lack of OpenGL."""
 
 
 class CheckpointError(PgdmError):
@@ -72,8 +136,12 @@ class RunError(PgdmError):
 
 
 class SweepError(PgdmError):
-    """A sweep's folder cannot be used, or what was asked does not fit what is in it."""
+    """A sweep's folder cannot be used, or does not match the request."""
 
 
 class TrackingError(PgdmError):
-    """A tracker could not be reached or refused a record."""
+    """A tracker could not be reached or rejected a record."""
+
+
+class ZooError(PgdmError):
+    """A zoo of policies cannot be reached, or is damaged."""

@@ -1,17 +1,20 @@
-"""Environments by task id, for Python, Gymnasium and TorchRL."""
+"""Environments by task id, for Python, Gymnasium, TorchRL and Stable-Baselines3."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from pgdm.config.groups import available
-from pgdm.errors import ConfigError
+from pgdm.errors import ConfigError, check_interpreter
+from pgdm.sim.gl import deferred
 
 if TYPE_CHECKING:
     from pgdm.envs.batch_env import BatchEnv
     from pgdm.envs.gym import PgdmEnv
+    from pgdm.envs.sb3 import PgdmVecEnv
     from pgdm.envs.torchrl import PgdmTorchRLEnv
 
 _log = logging.getLogger(__name__)
@@ -36,11 +39,11 @@ def make_batch(
         task: task id, such as ``hammer-use1``.
         num_envs: N.
         num_threads: threads that step them; 0 takes one per core.
-        seed: for tasks that vary per reset.
-        auto_reset: whether finished rows restart by themselves.
+        seed: seed of the per-reset variation, in tasks that have one.
+        auto_reset: whether rows restart automatically when their episode ends.
         offline: whether missing assets are an error instead of being fetched.
-        overrides: more settings, as on ``pgdm-run``'s command line. The env is one to train in:
-            with a shaping (``["+experiment=fast"]`` has one) its rewards include what that adds.
+        overrides: more settings, as on ``pgdm-run``'s command line. The env is one to train in: a
+            shaping (``["+experiment=fast"]`` has one) is part of its rewards.
         choices: an option of a group by name: ``pregrasp="planned"``, ``obs="released"``,
             ``action="absolute"``, ``method="pgdm"``, ``ablation="none"``.
 
@@ -49,7 +52,7 @@ def make_batch(
         terminated (N,), truncated (N,), info``; see `pgdm.envs.batch_env.BatchEnv.step`.
 
     Raises:
-        ConfigError: if a name or value is wrong.
+        ConfigError: if a name or value is wrong, or the simulations do not fit into the memory.
         LibraryError: if the task's assets are missing.
     """
     for name in choices:
@@ -58,8 +61,9 @@ def make_batch(
                 f"make_batch has no argument '{name}'; groups: {', '.join(_GROUPS)}, "
                 "other settings go into overrides=['key=value']"
             )
-    from pgdm.config.store import compose
-    from pgdm.experiment import assets, env_builder
+    with deferred():  # as commands do
+        from pgdm.config.compose import compose
+        from pgdm.experiment import assets, env_builder
 
     chosen = [f"{group}={option}" for group, option in choices.items()]
     cfg = compose([f"task={task}", f"offline={str(offline).lower()}", *chosen, *overrides])
@@ -71,9 +75,25 @@ def make_batch(
 
 def make_torchrl(task: str, *, num_envs: int = 64, **kwargs: Any) -> PgdmTorchRLEnv:
     """Return N simulations of a task as a TorchRL EnvBase; arguments as `make_batch`."""
+    check_interpreter()
     from pgdm.envs.torchrl import PgdmTorchRLEnv
 
     return PgdmTorchRLEnv(make_batch(task, num_envs=num_envs, auto_reset=False, **kwargs))
+
+
+def make_sb3(task: str, *, num_envs: int = 64, **kwargs: Any) -> PgdmVecEnv:
+    """Return N simulations of a task as a Stable-Baselines3 VecEnv; arguments as `make_batch`.
+
+    Raises:
+        ConfigError: also if Stable-Baselines3 is not installed.
+    """
+    if find_spec("stable_baselines3") is None:
+        raise ConfigError(
+            "make_sb3 needs Stable-Baselines3: pip install -c constraints.txt -e '.[sb3]'"
+        )
+    from pgdm.envs.sb3 import PgdmVecEnv
+
+    return PgdmVecEnv(make_batch(task, num_envs=num_envs, **kwargs))
 
 
 def make_gym(task: str, *, render_mode: str | None = None, **kwargs: Any) -> PgdmEnv:
@@ -88,10 +108,15 @@ def make_gym(task: str, *, render_mode: str | None = None, **kwargs: Any) -> Pgd
 
 
 def register() -> None:
-    """Tell Gymnasium of all tasks, as ``pgdm/<task>-v0``."""
+    """Register all tasks with Gymnasium, as ``pgdm/<task>-v0``."""
     import gymnasium
 
-    for task in available("task"):
+    try:
+        tasks = available("task")
+    except ConfigError as error:
+        _log.warning("the tasks are not known to Gymnasium: %s", error)
+        return
+    for task in tasks:
         gymnasium.register(
             id=f"pgdm/{task}-v0", entry_point="pgdm.make:make_gym", kwargs={"task": task}
         )

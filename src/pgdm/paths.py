@@ -1,23 +1,25 @@
-"""Where things are kept, and how a file there is replaced."""
+"""Folders of pgdm, names that become part of a path, and atomic replacement of files."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from pgdm.errors import ConfigError
+
 TEMPORARY = ".tmp-"
-"""How the names of unfinished files begin."""
+"""Prefix of the names of unfinished files."""
+
+_NAME = re.compile(r"\w[\w.+-]{0,99}")
+"""The rule for everything that names a file or folder; it allows neither ``/`` nor ``..`` alone."""
 
 
 def home() -> Path:
     """Return ``PGDM_HOME``, by default ``pgdm`` in the user's cache directory."""
-    chosen = os.environ.get("PGDM_HOME")
-    if chosen:
-        return Path(chosen).expanduser().absolute()
-    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(cache).expanduser().absolute() / "pgdm"
+    return _chosen("PGDM_HOME", "XDG_CACHE_HOME", "~/.cache")
 
 
 def library() -> Path:
@@ -26,21 +28,46 @@ def library() -> Path:
 
 
 def downloads() -> Path:
-    """Return the folder where downloaded packages are kept."""
+    """Return the folder of downloaded packages."""
     return home() / "downloads"
 
 
 def user() -> Path:
-    """Return the folder of what people make themselves: settings, objects, motions, pre-grasps.
+    """Return the folder of the user's own settings, objects, motions and pre-grasps.
 
-    ``PGDM_USER_DIR``, by default ``pgdm`` in the user's configuration directory. Unlike a cache it
-    holds what nothing can bring back.
+    ``PGDM_USER_DIR``, by default ``pgdm`` in the user's configuration directory. Unlike a cache its
+    contents cannot be restored.
     """
-    chosen = os.environ.get("PGDM_USER_DIR")
-    if chosen:
-        return Path(chosen).expanduser().absolute()
-    config = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
-    return Path(config).expanduser().absolute() / "pgdm"
+    return _chosen("PGDM_USER_DIR", "XDG_CONFIG_HOME", "~/.config")
+
+
+def _chosen(variable: str, base_variable: str, base: str) -> Path:
+    if chosen := os.environ.get(variable):
+        return expanded(chosen, f"{variable}=")
+    cure = f"set HOME or {variable}"
+    return expanded(os.environ.get(base_variable) or base, cure=cure) / "pgdm"
+
+
+def expanded(
+    path: str | os.PathLike[str], shown: str = "", cure: str = "write the whole path"
+) -> Path:
+    """Return an absolute path, a leading ``~`` or ``~user`` replaced by the home folder.
+
+    Args:
+        path: as written.
+        shown: what precedes it in messages.
+        cure: what to do if there is no such home folder.
+
+    Raises:
+        ConfigError: if there is none: many containers have neither ``HOME`` nor an entry for the
+            user.
+    """
+    try:
+        return Path(path).expanduser().absolute()
+    except RuntimeError as error:
+        raise ConfigError(
+            f"{shown}{path}: no home folder is known for '{Path(path).parts[0]}'; {cure}"
+        ) from error
 
 
 def user_conf() -> Path:
@@ -53,16 +80,62 @@ def runs() -> Path:
     return Path.cwd() / "runs"
 
 
+def check_path_part(kind: str, name: object) -> None:
+    """Check a name that may become part of a path.
+
+    Args:
+        kind: what it stands for, such as ``task.id``.
+        name: the name.
+
+    Raises:
+        ConfigError: if it is not a letter, digit or ``_``, followed by up to 99 of these, ``.``,
+            ``+`` and ``-``.
+    """
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        shown = repr(name) if len(repr(name)) <= 60 else f"{name!r:.57}..."
+        raise ConfigError(
+            f"{kind} {shown} is not valid: give letters, digits, '_', '-', '+' and '.', the first "
+            "of them a letter, digit or '_', 100 at most"
+        )
+
+
+def as_name(text: str) -> str:
+    """Return a valid name made from any text, such as the name of an experiment."""
+    return re.sub(r"[^\w.+-]+", "-", text).lstrip(".+-")[:100] or "_"
+
+
+def inside(folder: Path, *names: str, kind: str = "name", suffix: str = "") -> Path:
+    """Join names to a folder: the one way from a name to a path.
+
+    Args:
+        folder: the folder.
+        names: of folders, each in the one before, and at last of the file.
+        kind: what they stand for, for messages.
+        suffix: appended to the last name, such as ``.npz``.
+
+    Raises:
+        ConfigError: if one is not a valid name.
+    """
+    for name in names:
+        check_path_part(kind, name)
+    return folder.joinpath(*names[:-1], names[-1] + suffix)
+
+
+def leaves(path: Path, folder: Path) -> bool:
+    """Return whether a path is outside of a folder once links are followed."""
+    return not path.resolve().is_relative_to(folder.resolve())
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a name to write to; what was written takes the place of ``path``, whole or not at all.
+    """Yield a temporary file name; the file written there replaces ``path`` atomically.
 
-    Whoever looks sees the old file or the new one, also after a loss of power.
+    Readers see the old file or the new one, also after a power failure.
 
     Raises:
         OSError: if the file cannot be written; the old one is untouched.
     """
-    # Its ending stays: libraries tell a format by it.
+    # With the same suffix, from which libraries infer the format.
     temp = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
     try:
         yield temp
@@ -76,9 +149,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def restoring(folder: Path) -> Iterator[None]:
-    """Take back what was made in a folder, the folder too, if what follows fails.
+    """Undo what the block does in a folder if it fails: files it creates, or the folder itself.
 
-    Files that were there before and have grown get their old length back.
+    Files that grew get their old length back.
     """
     before = {path: path.stat() for path in folder.glob("*")}
     try:
@@ -87,7 +160,7 @@ def restoring(folder: Path) -> Iterator[None]:
         for path in folder.glob("*"):
             if path not in before:
                 path.unlink()
-            elif path.stat().st_ino == before[path].st_ino:  # else another has taken its place
+            elif path.stat().st_ino == before[path].st_ino:  # else it was replaced
                 os.truncate(path, before[path].st_size)
         with contextlib.suppress(OSError):
             folder.rmdir()

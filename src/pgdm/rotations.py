@@ -1,4 +1,4 @@
-"""Batched rotations in torch. Quaternions are unit, wxyz; all functions broadcast."""
+"""Batched rotations in torch. Quaternions are unit quaternions, wxyz; all functions broadcast."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def multiply(p: Tensor, q: Tensor) -> Tensor:
-    """Return the Hamilton product p*q, (..., 4): first rotate by q, then by p."""
+    """Return the Hamilton product p q, (..., 4): the rotation by q, then by p."""
     pw, px, py, pz = p.unbind(-1)
     qw, qx, qy, qz = q.unbind(-1)
     return torch.stack(
@@ -37,9 +37,8 @@ def rotate(q: Tensor, v: Tensor) -> Tensor:
 def angle(p: Tensor, q: Tensor) -> Tensor:
     """Return the angle of the rotation between p and q, (...), rad in [0, pi].
 
-    Half of it lies between p and q as unit vectors, of which |p - q| and |p + q| are twice the
-    sine and cosine of its half: accurate near 0, where the arccos of their product is not. The
-    sign of a quaternion does not matter.
+    4 atan2(min(|p - q|, |p + q|), max(|p - q|, |p + q|)): unlike 2 arccos |p . q|, it is accurate
+    near 0. The sign of a quaternion does not matter.
     """
     apart, together = torch.linalg.vector_norm(torch.stack((p - q, p + q)), dim=-1)
     return 4.0 * torch.atan2(torch.minimum(apart, together), torch.maximum(apart, together))
@@ -66,8 +65,8 @@ def from_euler_xyz(angles: Tensor) -> Tensor:
 def to_euler_xyz(q: Tensor) -> Tensor:
     """Return intrinsic X-Y-Z Euler angles (..., 3), rad, of unit quaternions (..., 4).
 
-    The middle angle lies in [-pi/2, pi/2]; at its ends only the sum or difference of the two
-    others is defined, and one of them comes out as it may.
+    The middle angle lies in [-pi/2, pi/2]. At +-pi/2 (gimbal lock) only the sum or difference of
+    the other two is determined; how it is split between them is arbitrary.
     """
     m = to_matrix(q)
     return torch.stack(

@@ -1,4 +1,4 @@
-"""One integer in, named independent random streams out."""
+"""Named, independent random streams derived from one integer."""
 
 from __future__ import annotations
 

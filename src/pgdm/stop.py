@@ -1,32 +1,30 @@
-"""Signals that ask a run to stop: the first at a safe point, the second at once."""
+"""Signals that stop a run: the first at a safe point, the second immediately."""
 
 from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable
-from types import FrameType, TracebackType
-from typing import Protocol
+from types import FrameType
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
 STOPPED = tuple(128 + number for number in _SIGNALS)
-"""Exit codes of what has stopped because it was asked to, as a shell tells them."""
+"""Exit codes of a process stopped by one of these signals, as shells report them."""
 
 
 class StopRequest:
-    """Within ``with``, a signal sets a flag that the trainer looks at between iterations.
+    """Within ``with``, a signal sets a flag that the trainer polls between iterations.
 
-    Ctrl-C, SIGTERM, and SIGUSR2, which Slurm sends before a job's time is up. Outside the main
-    thread Python refuses signal handlers; the flag then stays unset.
+    Signals: Ctrl-C, SIGTERM, and SIGUSR2, which Slurm sends before a job's time is up. Outside the
+    main thread Python allows no signal handlers; the flag then stays unset.
 
     Args:
-        patient: whether further signals change nothing: Slurm sends several, and SIGKILL last.
+        patient: whether further signals are ignored: Slurm sends several, and SIGKILL last.
     """
 
     def __init__(self, patient: bool = False) -> None:
         self._patient = patient
         self.signal: int | None = None
-        """The signal that came, if any."""
+        """The signal received, if any."""
         self._before: dict[int, signal._HANDLER] = {}
 
     def __call__(self) -> bool:
@@ -35,7 +33,7 @@ class StopRequest:
 
     @property
     def exit_code(self) -> int:
-        """The shell's code for a process that was stopped by this signal, one of ``STOPPED``."""
+        """The shell's exit code for this signal, one of ``STOPPED``."""
         return 128 + (self.signal or signal.SIGINT)
 
     def __enter__(self) -> StopRequest:
@@ -46,12 +44,7 @@ class StopRequest:
                 return self
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
         self._before.clear()
@@ -63,28 +56,6 @@ class StopRequest:
             raise KeyboardInterrupt
         self.signal = number
         how = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
-        again = "" if self._patient else " (again: stop at once)"
+        again = "" if self._patient else " (again: stop immediately)"
         sys.stderr.write(f"\n{how}: saving and stopping at the next safe point{again}\n")
         sys.stderr.flush()
-
-
-class Listener(Protocol):
-    """Told how far something long is."""
-
-    def __call__(self, step: str, done: int, total: int) -> None:
-        """Hear that ``done`` of ``total`` are done of a step."""
-        ...
-
-
-def stoppable(stop: Callable[[], bool], inner: Listener) -> Listener:
-    """Return a progress listener that lets what it listens to end at a stop request.
-
-    What was downloaded by then stays for the next time.
-    """
-
-    def progress(step: str, done: int, total: int) -> None:
-        if stop():
-            raise KeyboardInterrupt
-        inner(step, done, total)
-
-    return progress

@@ -1,7 +1,6 @@
-"""MuJoCo's bindings are compiled and ship no types, so that its names are Any to the checker.
+"""MuJoCo's bindings are compiled and ship no types; its names are Any to the type checker.
 
-Stubs made from the bindings by a generator were tried: they refuse valid code, such as a list
-assigned to a body's position.
+Stubs generated from the bindings reject valid code, such as assigning a list to a body's position.
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""New tasks: an object, a hand, a motion and a pre-grasp become one more task of the user's."""
+"""The user's own tasks, each made of an object, a hand, a motion and a pre-grasp."""
 
 from __future__ import annotations
 

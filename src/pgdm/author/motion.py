@@ -1,4 +1,4 @@
-"""The motion of a new task: read, mended where asked for, checked, begun where the object rests."""
+"""The motion of a new task: read, mended on request, checked, started where the object rests."""
 
 from __future__ import annotations
 
@@ -9,49 +9,58 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pgdm.errors import ConfigError, UnknownNameError
-from pgdm.library import animate, motion_checks, own, pose_file
-from pgdm.library.animate import STEP_S, continuous
-from pgdm.library.author_drop import Drop, drop
-from pgdm.library.motion_checks import Poses, TableCheck
+from pgdm.errors import ConfigError, check_name
+from pgdm.library.authored import own
+from pgdm.library.authored.drop import Drop, drop
+from pgdm.library.checks import motion as motion_checks
+from pgdm.library.checks.motion import Poses, TableCheck
+from pgdm.library.files import keyframes as animate
+from pgdm.library.files import poses as pose_file
+from pgdm.library.files.columns import check_order
+from pgdm.library.files.keyframes import STEP_S, continuous
 
 ORIGINS = ("com", "mesh")
 
 NEAR_M, NEAR_RAD = 0.01, 0.17
-"""How far the first pose may be from where the object rests: it is moved there, and said."""
-_BLEND_STEPS = 15  # control steps over which that move fades
-_TABLE_M = 0.4  # half of the table's side, less a margin
+"""Largest distance between first pose and resting pose that is blended away, with a note."""
+_BLEND_STEPS = 15  # control steps of the blend
+_NAME_THEM = (
+    "name the columns: a first line x,y,z,qx,qy,qz,qw in a .csv, 'columns' in a .json or .npz"
+)
+_TABLE_M = 0.4  # half of the table's side minus a margin
 
 
 @dataclass(frozen=True)
 class MotionRequest:
-    """What motion is asked for."""
+    """Where a motion comes from, and how to change it.
+
+    Exactly one of ``keyframes`` and ``poses`` is given.
+    """
 
     keyframes: Path | None
-    """YAML file of keyframes; or
-    """
+    """YAML file of keyframes."""
     poses: Path | None
-    """a recorded motion: .csv, .npz or .json."""
+    """Recorded poses: .csv, .npz or .json."""
     origin: str = "com"
-    """What recorded positions are of: the centre of mass, or the origin of the mesh's file."""
+    """Point whose positions were recorded: ``com``, or ``mesh``, the origin of the mesh's file."""
     smooth: bool = False
-    """Filter a recorded motion, and give it a beginning and an end at rest."""
+    """Filter the motion, and start and end it at rest."""
     slower: float = 1.0
-    """Play it slower by this factor."""
+    """Factor by which to slow the motion down."""
     lift: bool = False
-    """Raise what lies in the table."""
+    """Raise poses that cut into the table."""
     settle: bool = False
-    """Carry the whole motion to where the object rests, however far that is."""
+    """Shift the whole motion to where the object comes to rest, however far that is."""
 
 
 @dataclass(frozen=True)
 class CheckedMotion:
-    """A motion that a hand may carry an object along."""
+    """A motion that passed all checks."""
 
     poses: Poses
-    """Its first is where the object rests."""
+    """The first is where the object rests."""
     notes: list[str]
-    """What was changed, a sentence each."""
+    """Changes, a sentence each."""
     source: str
     """``animator`` or ``recorded``."""
 
@@ -59,43 +68,42 @@ class CheckedMotion:
 def make_motion(
     request: MotionRequest, object_xml: Path, model: mujoco.MjModel, body: int
 ) -> CheckedMotion:
-    """Make the motion of a task.
+    """Read, change and check the motion of a task.
 
     Args:
-        request: what is asked for.
+        request: where the motion comes from.
         object_xml: the object's model.
         model: the task's scene.
         body: id of the object's body in it.
 
     Raises:
-        ConfigError: the motion cannot be carried; says where and what would help.
+        ConfigError: no hand could carry the object so; the message names the pose and a remedy.
         CorruptAssetError: its file is damaged.
     """
     if (request.keyframes is None) == (request.poses is None):
         raise ConfigError("a task needs one motion: --keyframes FILE or --poses FILE")
-    if request.origin not in ORIGINS:
-        raise UnknownNameError("origin", request.origin, ORIGINS)
+    check_name("origin", request.origin, ORIGINS)
     if request.keyframes is not None and request.origin != "com":
-        raise ConfigError(f"--origin {request.origin} is for --poses; keyframes are of the com")
+        raise ConfigError(f"--origin {request.origin} is for --poses; keyframes give the com")
     notes: list[str] = []
     if request.keyframes is not None:
         poses, label = _animated(request.keyframes, object_xml, notes), str(request.keyframes)
     else:
         assert request.poses is not None
-        poses, label = _recorded(request, model, body, notes), str(request.poses)
+        poses, label = _recorded(request, object_xml, model, body, notes), str(request.poses)
     if request.slower != 1.0:
         poses = motion_checks.slower(poses, request.slower)
-        notes.append(f"played {request.slower:g} times slower")
+        notes.append(f"slowed down by a factor of {request.slower:g}")
     if request.smooth:
         poses = motion_checks.smoothed(poses)
-        notes.append("smoothed, with a rest put before and after")
-    poses = _begun_at_rest(poses, request.settle, object_xml, label, notes)
+        notes.append("smoothed, with a rest added before and after")
+    poses = _started_at_rest(poses, request.settle, object_xml, label, notes)
     table = TableCheck(model, body)
     if request.lift:
         raised = table.lifted(poses)
         most = float((raised.pos - poses.pos)[:, 2].max())
         if most > 0:
-            notes.append(f"raised by up to {1e3 * most:.0f} mm where it was in the table")
+            notes.append(f"raised by up to {1e3 * most:.0f} mm where it cut into the table")
         poses = raised
     motion_checks.check_motion(poses, label)
     table.check(poses, label)
@@ -111,16 +119,21 @@ def _animated(path: Path, object_xml: Path, notes: list[str]) -> Poses:
     _check_rest(rest, str(path))
     if rest.turned_rad > NEAR_RAD:
         notes.append(
-            f"the object falls over when it is put so, by {np.rad2deg(rest.turned_rad):.0f} "
-            "degrees; the motion begins where it comes to rest"
+            f"the object falls over from this pose, by {np.rad2deg(rest.turned_rad):.0f} degrees; "
+            "the motion starts where it comes to rest"
         )
     return Poses(*animation.at(rest.com, rest.quat))
 
 
-def _recorded(request: MotionRequest, model: mujoco.MjModel, body: int, notes: list[str]) -> Poses:
+def _recorded(
+    request: MotionRequest, object_xml: Path, model: mujoco.MjModel, body: int, notes: list[str]
+) -> Poses:
     assert request.poses is not None
     found = pose_file.read(request.poses)
     notes += found.repairs
+    if not found.named:
+        rest = Rotation.from_quat(drop(object_xml).quat, scalar_first=True)
+        check_order(found.quat[0], rest, f"{request.poses}: row 0", _NAME_THEM)
     if request.origin == "com":
         return Poses(found.pos, found.quat)
     offset = model.body_ipos[body]
@@ -131,7 +144,7 @@ def _recorded(request: MotionRequest, model: mujoco.MjModel, body: int, notes: l
     return Poses(found.pos + turns.apply(offset), found.quat)
 
 
-def _begun_at_rest(
+def _started_at_rest(
     poses: Poses, settle: bool, object_xml: Path, label: str, notes: list[str]
 ) -> Poses:
     """Return the motion with its first pose where the object rests on the table."""
@@ -139,7 +152,7 @@ def _begun_at_rest(
     place = float(poses.pos[0, 0]), float(poses.pos[0, 1])
     if max(abs(place[0]), abs(place[1])) > _TABLE_M:
         raise ConfigError(
-            f"{label}: begins at x = {place[0]:.2f}, y = {place[1]:.2f} m, beside the table, which "
+            f"{label}: starts at x = {place[0]:.2f}, y = {place[1]:.2f} m, off the table, which "
             f"reaches to {_TABLE_M:g} m"
         )
     rest = drop(object_xml, place, first)
@@ -147,23 +160,23 @@ def _begun_at_rest(
     away = float(np.linalg.norm(rest.com - poses.pos[0]))
     if (away > NEAR_M or rest.turned_rad > NEAR_RAD) and not settle:
         raise ConfigError(
-            f"{label}: the object does not rest where the motion begins: it ends {100 * away:.1f} "
-            f"cm away, turned by {np.rad2deg(rest.turned_rad):.0f} degrees; --settle carries the "
-            "motion to where it rests"
+            f"{label}: the object does not rest where the motion starts: it settles "
+            f"{100 * away:.1f} cm away, turned by {np.rad2deg(rest.turned_rad):.0f} degrees; "
+            "--settle shifts the motion to where it rests"
         )
     turn = Rotation.from_quat(rest.quat, scalar_first=True) * first.inv()
     turns = Rotation.from_quat(poses.quat, scalar_first=True)
     if settle:
-        notes.append(f"carried by {1e3 * away:.0f} mm to where the object rests")
+        notes.append(f"shifted by {1e3 * away:.0f} mm to where the object rests")
         quat = (turns * first.inv() * turn * first).as_quat(scalar_first=True)
         return Poses(poses.pos - poses.pos[0] + rest.com, continuous(quat))
     if away > 1e-4 or rest.turned_rad > 1e-3:
         notes.append(
-            f"its first {_BLEND_STEPS * STEP_S:.1f} s were bent to begin where the object rests, "
-            f"{1e3 * away:.1f} mm and {np.rad2deg(rest.turned_rad):.1f} degrees away"
+            f"its first {_BLEND_STEPS * STEP_S:.1f} s were blended to start where the object "
+            f"rests, {1e3 * away:.1f} mm and {np.rad2deg(rest.turned_rad):.1f} degrees away"
         )
     share = np.clip(1.0 - np.arange(len(poses.pos)) / _BLEND_STEPS, 0.0, 1.0)
-    share = share**3 * (10 - 15 * share + 6 * share**2)  # fades without a kink
+    share = share**3 * (10 - 15 * share + 6 * share**2)  # minimum-jerk blend from 1 to 0
     bends = Rotation.from_rotvec(np.outer(share, turn.as_rotvec()))
     quat = (bends * turns).as_quat(scalar_first=True)
     return Poses(poses.pos + np.outer(share, rest.com - poses.pos[0]), continuous(quat))
@@ -172,6 +185,6 @@ def _begun_at_rest(
 def _check_rest(rest: Drop, label: str) -> None:
     if not rest.rests:
         raise ConfigError(
-            f"{label}: the object does not come to rest on the table where it is put "
-            f"({100 * rest.speed_m_s:.1f} cm/s after 4 s); turn it in the file, so that it lies"
+            f"{label}: the object does not come to rest on the table from this pose "
+            f"({100 * rest.speed_m_s:.1f} cm/s after 4 s); turn it so that it lies stably"
         )

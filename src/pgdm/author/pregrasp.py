@@ -1,21 +1,22 @@
-"""The pre-grasp of a new task: searched near the object, or taken from a file or another task."""
+"""The pre-grasp of a new task: searched near the object, or read from a file."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import torch
 
 from pgdm.errors import ConfigError
-from pgdm.library import Library, Start, figures, pregrasp_file
-from pgdm.library.motion_checks import Poses
-from pgdm.library.report import Progress
+from pgdm.library import Library, Start
+from pgdm.library.checks.motion import Poses
+from pgdm.library.files import pregrasp as pregrasp_file
+from pgdm.library.progress import StepProgress, counted
+from pgdm.library.tasks import SUBSTEPS
 from pgdm.motion.reference import ObjectReference
+from pgdm.pregrasp.hand_geometry import mean_fingers, mount_rotation
 from pgdm.pregrasp.near import NearPose, poses_near
 from pgdm.pregrasp.quality import LiftTest
 from pgdm.sim.contact import HandContact
@@ -25,13 +26,13 @@ from pgdm.wrist.path import carried_path
 CHOICES = ("mean", "open", "later")
 
 SLACK_M, SLACK_RAD = 0.03, 0.2
-"""By how much the wrist, carried rigidly with the object, may leave its range: so much the fingers
-and a policy's corrections make up for."""
+"""How far the base, with the hand moving rigidly with the object, may leave its range: the fingers
+and the policy's corrections compensate for that much."""
 _TOUCH_M = 1e-4
-_SLIDES = 3  # of the base's joints, the first ones
-_HAND_M = 0.3  # how much less than the object the wrist may have to go, where that turns
+_SLIDES = 3  # the first joints of the base
+_HAND_M = 0.3  # how much less than a turning object the base may have to travel
 _CURE = "shorten the motion, or put the object elsewhere (place in the keyframes)"
-_COMPARED = 5  # poses that are tried in the simulation
+_COMPARED = 5  # poses that are lift-tested
 
 
 @dataclass(frozen=True)
@@ -40,76 +41,84 @@ class FoundPregrasp:
 
     qpos: np.ndarray  # (nq,) whole scene
     source: str
-    """What the task's file says of it."""
+    """``pregrasp_source`` of the task's file."""
     notes: list[str]
 
 
 def make_pregrasp(
-    choice: str, scene: Scene, qpos: np.ndarray, poses: Poses, library: Library, progress: Progress
+    choice: str,
+    scene: Scene,
+    qpos: np.ndarray,
+    poses: Poses,
+    library: Library,
+    progress: StepProgress,
 ) -> FoundPregrasp:
-    """Make the pre-grasp of a new task.
+    """Find the pre-grasp of a new task.
 
     Args:
         choice: ``mean`` or ``open`` (a search with the fingers near that posture), ``later`` (the
-            hand's reset pose), a pre-grasp's file, or a task whose fingers are taken.
+            hand's reset pose), a pre-grasp's file, or a task (a search near its finger pose).
         scene: the new task's.
         qpos: whole scene (nq,), the object where it rests.
         poses: the task's motion.
-        library: where other tasks' pre-grasps are.
-        progress: told how far the search is.
+        library: library with the other tasks' pre-grasps.
+        progress: reports search and lift tests.
 
     Raises:
-        ConfigError: there is no such pre-grasp, it does not fit, or the wrist cannot follow.
-        SceneError: none was found that touches nothing.
+        ConfigError: there is no such pre-grasp, it does not fit, or the hand cannot follow.
+        SceneError: every pose that was found touches something.
     """
     if choice == "later":
-        return FoundPregrasp(qpos, "none", ["starts from the hand's reset pose: no pre-grasp yet"])
+        note = "no pre-grasp yet: episodes start from the hand's reset pose"
+        return FoundPregrasp(qpos, "none", [note])
     _check_travel(scene, poses)
-    reach = wrist_beyond(scene, poses)
+    over = _base_over(scene, poses)
+
+    def beyond(qpos: np.ndarray) -> float:
+        return float(over(qpos).max().clip(0.0))
+
     if choice.endswith(".npz"):
         found = _from_file(Path(choice), scene, qpos)
     else:
         fingers = _fingers(choice, scene, library)
-        told = partial(progress, "pre-grasp")
-        poses_found = poses_near(scene, qpos, fingers, reach, progress=told)
-        following = [pose for pose in poses_found if reach(pose.qpos) == 0.0]
-        found = _firmest(scene, following or poses_found[:1])
-    if reach(found.qpos) > 0.0:
-        over = _wrist_over(scene, poses)(found.qpos)
-        row, joint = np.unravel_index(int(over.argmax()), over.shape)
+        nearest = poses_near(scene, qpos, fingers, beyond, progress=progress)
+        following = [pose for pose in nearest if beyond(pose.qpos) == 0.0]
+        found = _firmest(scene, following or nearest[:1], progress)
+    excess = over(found.qpos)
+    if excess.max() > 0.0:
+        row, joint = np.unravel_index(int(excess.argmax()), excess.shape)
         raise ConfigError(
-            f"the wrist cannot follow the motion: carried with the object, joint "
-            f"{scene.model.joint(int(joint)).name} would leave its range by {over[row, joint]:.2f} "
-            f"{'m' if joint < _SLIDES else 'rad'} more than a policy can make up for, worst in row "
-            f"{row}; {_CURE}"
+            f"the hand cannot follow the motion: moving rigidly with the object, joint "
+            f"{scene.model.joint(int(joint)).name} would leave its range by "
+            f"{excess[row, joint]:.2f} {'m' if joint < _SLIDES else 'rad'} more than a policy can "
+            f"compensate for, most in row {row}; {_CURE}"
         )
     return found
 
 
 def _check_travel(scene: Scene, poses: Poses) -> None:
-    """Check that no base could carry the object that far, before a pose is searched.
+    """Check that the base could carry the object that far, before a pose is searched.
 
     Raises:
-        ConfigError: none could.
+        ConfigError: it could not, from any pose.
     """
-    mount = np.empty(9)
-    mujoco.mju_quat2Mat(mount, scene.index.mount_quat)
-    travel = np.ptp(poses.pos @ mount.reshape(3, 3), axis=0)
+    travel = np.ptp(poses.pos @ mount_rotation(scene), axis=0)
     low, high = scene.model.jnt_range[:_SLIDES].T
     far = travel - (high - low + 2 * SLACK_M + _HAND_M)
     if far.max() > 0:
         joint = int(far.argmax())
         raise ConfigError(
-            f"the wrist cannot follow the motion: the object goes {travel[joint]:.2f} m along "
+            f"the hand cannot follow the motion: the object goes {travel[joint]:.2f} m along "
             f"joint {scene.model.joint(joint).name}, which slides {high[joint] - low[joint]:.2f} "
             f"m; {_CURE}"
         )
 
 
-def _firmest(scene: Scene, poses: list[NearPose]) -> FoundPregrasp:
+def _firmest(scene: Scene, poses: list[NearPose], progress: StepProgress) -> FoundPregrasp:
     """Return, of the nearest poses, the one from which most random closings lift the object."""
-    lift, still = LiftTest(scene, figures.SUBSTEPS), np.zeros(scene.model.nv)
-    rates = [lift(Start(pose.qpos, still, None)) for pose in poses[:_COMPARED]]
+    lift, still = LiftTest(scene, SUBSTEPS), np.zeros(scene.model.nv)
+    tested = counted("lift tests", poses[:_COMPARED], progress)
+    rates = [lift(Start(pose.qpos, still, None)) for pose in tested]
     best = int(np.nanargmax(rates)) if lift.possible else 0
     pose = poses[best]
     tips = ", ".join(f"{1e3 * d:.0f}" for d in pose.tip_distances_m)
@@ -120,14 +129,8 @@ def _firmest(scene: Scene, poses: list[NearPose]) -> FoundPregrasp:
     return FoundPregrasp(pose.qpos, "search", notes)
 
 
-def wrist_beyond(scene: Scene, poses: Poses) -> Callable[[np.ndarray], float]:
-    """Return what tells, for qpos (nq,), by how much the wrist would leave its range, m or rad."""
-    over = _wrist_over(scene, poses)
-    return lambda qpos: float(over(qpos).max().clip(0.0))
-
-
-def _wrist_over(scene: Scene, poses: Poses) -> Callable[[np.ndarray], np.ndarray]:
-    """Return what tells, for qpos (nq,), by how much each base joint is beyond, (T, B) m or rad."""
+def _base_over(scene: Scene, poses: Poses) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function of qpos (nq,): how far each base joint leaves its range, (T, B) m, rad."""
     reference = ObjectReference(torch.from_numpy(poses.pos), torch.from_numpy(poses.quat))
     low, high = scene.model.jnt_range[: scene.index.num_base_joints].T
     slack = np.array([SLACK_M] * _SLIDES + [SLACK_RAD] * (len(low) - _SLIDES))
@@ -142,35 +145,28 @@ def _wrist_over(scene: Scene, poses: Poses) -> Callable[[np.ndarray], np.ndarray
 def _from_file(path: Path, scene: Scene, qpos: np.ndarray) -> FoundPregrasp:
     if not path.is_file():
         raise ConfigError(f"--pregrasp {path}: there is no such file")
-    stored, nu = pregrasp_file.read(path).pose.qpos, scene.model.nu
+    stored, count = pregrasp_file.read(path).pose.qpos, scene.index.num_joints
     if stored.shape != qpos.shape:
         raise ConfigError(
             f"--pregrasp {path}: has {stored.size} joint positions, hand '{scene.hand.name}' with "
             f"this object has {qpos.size}"
         )
-    found = np.concatenate((stored[:nu], qpos[nu:]))
+    found = np.concatenate((stored[:count], qpos[count:]))
     depth = HandContact(scene).depth(found)
     if depth > _TOUCH_M:
         raise ConfigError(
             f"--pregrasp {path}: the hand is {1e3 * depth:.1f} mm inside the object or the table"
         )
-    return FoundPregrasp(found, "file", [f"pre-grasp as in {path.name}"])
+    return FoundPregrasp(found, "file", [f"pre-grasp from {path.name}"])
 
 
 def _fingers(choice: str, scene: Scene, library: Library) -> np.ndarray:
-    """Return the finger joints (J,) rad that a search should stay near."""
+    """Return finger joint positions (J,) rad that the search should stay close to."""
     first = scene.hand.num_base_joints + scene.hand.num_wrist_joints
-    count = scene.model.nu - first
     if choice == "open":
-        return np.zeros(count)
+        return np.zeros(scene.index.num_joints - first)
     if choice == "mean":
-        mean = np.array(scene.hand.mean_fingers_rad)
-        if mean.shape != (count,):
-            raise ConfigError(
-                f"hand '{scene.hand.name}' states {mean.size} mean finger joints, it has {count}: "
-                "use --pregrasp open"
-            )
-        return mean
+        return mean_fingers(scene)
     if choice not in library.tasks():
         raise ConfigError(
             f"--pregrasp '{choice}' is neither {', '.join(CHOICES)}, a .npz file, nor a task of "
@@ -179,7 +175,7 @@ def _fingers(choice: str, scene: Scene, library: Library) -> np.ndarray:
     entry = library.entry(choice)
     if entry.hand != scene.hand.name or "mined" not in entry.starts:
         raise ConfigError(
-            f"--pregrasp '{choice}': its pre-grasp is of hand '{entry.hand}', this task's hand is "
+            f"--pregrasp '{choice}': its pre-grasp is for hand '{entry.hand}', this task's hand is "
             f"'{scene.hand.name}'"
         )
-    return library.motion(choice).starts["mined"].qpos[first : scene.model.nu]
+    return library.motion(choice).starts["mined"].qpos[first : scene.index.num_joints]

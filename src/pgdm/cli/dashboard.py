@@ -1,4 +1,4 @@
-"""``pgdm dashboard``: MLflow's pages over a folder of runs, for this machine only."""
+"""``pgdm dashboard``: MLflow's pages on a folder of runs, for this machine only."""
 
 from __future__ import annotations
 
@@ -13,55 +13,68 @@ import tempfile
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import IO, Annotated
+from typing import IO, Annotated, Any
 
 import typer
 
 from pgdm import paths
+from pgdm.cli.console.screen import bars, notify
+from pgdm.cli.options import Runs
 from pgdm.errors import RunError, TrackingError
+from pgdm.runs.folder import ARTIFACTS, find_runs
+from pgdm.tracking.address import chosen
 from pgdm.tracking.mlflow import environment, sqlite_file, store_uri
-from pgdm.tracking.run_folder import ARTIFACTS, find_runs
 
 HOST = "127.0.0.1"
-"""Only this machine: MLflow asks for no password."""
+"""This machine only, since MLflow asks for no password."""
 START_S = 120.0
 _STOP_S = 5.0
-_DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # never by a proxy
+_VIEW = "pgdm"
+"""Name of the view of the runs' table."""
+_COLUMNS = [
+    "metrics.`eval_sampled/success`",
+    "metrics.`train/steps_per_s`",
+    "tags.`task`",
+    "tags.`seed`",
+]
+"""Columns of the table, besides names and times, as MLflow's page names them."""
+_DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # without a proxy
 _STOPPERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def dashboard(
-    root: Annotated[
-        Path | None, typer.Argument(metavar="DIR", help="Folder of runs [runs].")
-    ] = None,
-    port: Annotated[int, typer.Option(help="Port; another one is taken if it is in use.")] = 5000,
+    root: Runs = None,
+    port: Annotated[int, typer.Option(help="Port; if it is taken, another one is used.")] = 5000,
     uri: Annotated[
-        str | None, typer.Option(help="Another MLflow database, such as sqlite:////data/x.db.")
+        str | None, typer.Option(help="Another MLflow store, such as sqlite:////data/x.db.")
     ] = None,
 ) -> None:
-    """Show runs in the browser (MLflow, on this machine only); Ctrl-C ends it."""
+    """Show runs in the browser with MLflow; Ctrl-C quits.
+
+    The pages are served to this machine only.
+    """
     root = (root or paths.runs()).absolute()
-    if uri is not None and uri.startswith(("http://", "https://")):
-        print(f"{uri} is an MLflow server with pages of its own: open it in a browser")
+    address = chosen(uri, "--uri", notify) or store_uri(root)
+    if address.startswith(("http://", "https://")):
+        print(f"{address} is an MLflow server with pages of its own: open it in a browser")
         return
-    address = uri or store_uri(root)
     _ensure_store(address, root)
-    chosen = free_port(port)
-    if chosen != port:
-        print(f"port {port} is taken, using {chosen}")
-    with tempfile.TemporaryFile() as output, _served(_command(address, root, chosen), output) as ui:
-        url = f"http://{HOST}:{chosen}"
+    free = free_port(port)
+    if free != port:
+        print(f"port {port} is taken, using {free}")
+    with tempfile.TemporaryFile() as output, _served(_command(address, root, free), output) as ui:
+        url = f"http://{HOST}:{free}"
         _wait_until_up(ui, url, output)
-        print(f"the runs in {root} are shown at\n  {url}{_page(url)}\nCtrl-C ends it", flush=True)
+        print(f"the runs in {root} are shown at\n  {url}{_page(url)}\nCtrl-C quits", flush=True)
         code = ui.wait()
-        raise TrackingError(f"MLflow's pages ended with code {code}: {_last_line(output)}")
+        raise TrackingError(f"MLflow's server exited with code {code}: {_last_line(output)}")
 
 
 def free_port(wanted: int) -> int:
-    """Return ``wanted`` if nobody listens there, else a port that is free."""
+    """Return ``wanted`` if it is free, else another free port."""
     for port in (wanted, 0):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -74,7 +87,7 @@ def free_port(wanted: int) -> int:
 
 
 def _ensure_store(uri: str, root: Path) -> None:
-    """Fill a store that is missing from the runs themselves."""
+    """Fill a missing store from the run folders."""
     file = sqlite_file(uri)
     if file is None or file.exists():
         return
@@ -82,42 +95,54 @@ def _ensure_store(uri: str, root: Path) -> None:
         raise RunError(f"there are no runs in '{root}'; `pgdm-run` starts one, or name a folder")
     from pgdm.tracking.sync import sync
 
-    print(f"{file} does not exist yet: made from the run folders")
-    sync(root, uri)
+    print(f"{file} does not exist yet: filling it from the run folders")
+    sync(root, uri, lambda done: notify(f"{done.action:<11}{done.folder.path}"))
 
 
 def _command(uri: str, root: Path, port: int) -> list[str]:
-    # The interpreter that runs this has MLflow, whether its environment is activated or not.
+    # This interpreter has MLflow, whether its environment is activated or not.
     command = [sys.executable, "-m", "mlflow", "server", "--host", HOST, "--port", str(port)]
     command += ["--backend-store-uri", uri, "--workers", "1", "--no-serve-artifacts"]
+    # By default MLflow also answers to names such as 10.evil.example, which lead here if their
+    # owner wants; the browser would let that site read the runs.
+    command += ["--allowed-hosts", ",".join((HOST, f"{HOST}:*", "localhost", "localhost:*"))]
     return [*command, "--default-artifact-root", str(root / ARTIFACTS)]
 
 
 @contextlib.contextmanager
 def _served(command: list[str], output: IO[bytes]) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the server, and end it and its children together, whatever ends this process."""
+    """Run the server; stop it and its children however this process stops."""
     env = {**environment(), "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
-    before = {number: signal.signal(number, _stop) for number in _STOPPERS}
-    server = subprocess.Popen(
-        command,
-        env=env,
-        stdin=subprocess.DEVNULL,
-        stdout=output,
-        stderr=subprocess.STDOUT,
-        start_new_session=True,  # a group of its own: signals reach its workers, not us
-    )
+    with on_stop(_stop):
+        server = subprocess.Popen(
+            command,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,  # a group of its own: signals reach its workers, not us
+        )
+        try:
+            yield server
+        except _StopError:
+            print("dashboard closed")
+        finally:
+            _kill(server)
+
+
+@contextlib.contextmanager
+def on_stop(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Handle the signals that stop a program, while inside."""
+    before = {number: signal.signal(number, handler) for number in _STOPPERS}
     try:
-        yield server
-    except _StopError:
-        print("dashboard ended")
+        yield
     finally:
-        _end(server)
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
 
 
 class _StopError(Exception):
-    """Asked to end."""
+    """A signal to stop has come."""
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
@@ -125,7 +150,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
     raise _StopError
 
 
-def _end(server: subprocess.Popen[bytes]) -> None:
+def _kill(server: subprocess.Popen[bytes]) -> None:
     for number in (signal.SIGTERM, signal.SIGKILL):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(server.pid, number)
@@ -135,31 +160,45 @@ def _end(server: subprocess.Popen[bytes]) -> None:
 
 
 def _wait_until_up(server: subprocess.Popen[bytes], url: str, output: IO[bytes]) -> None:
-    end = time.monotonic() + START_S
-    while time.monotonic() < end:
-        if server.poll() is not None:
-            raise TrackingError(f"MLflow's pages do not start: {_last_line(output)}")
-        try:
-            with _DIRECT.open(f"{url}/health", timeout=2):
-                return
-        except (urllib.error.URLError, TimeoutError, ConnectionError):
-            time.sleep(0.2)
-    raise TrackingError(f"MLflow's pages do not answer at {url}: {_last_line(output)}")
+    notify(f"starting MLflow's server, and waiting for its answer at {url}")
+    begin = time.monotonic()
+    with bars() as progress:
+        while (waited_s := time.monotonic() - begin) < START_S:
+            progress("waiting for MLflow [s]", int(waited_s), 0)
+            if server.poll() is not None:
+                raise TrackingError(f"MLflow's server does not start: {_last_line(output)}")
+            try:
+                with _DIRECT.open(f"{url}/health", timeout=2):
+                    return
+            except (urllib.error.URLError, TimeoutError, ConnectionError):
+                time.sleep(0.2)
+    raise TrackingError(f"MLflow's server does not answer at {url}: {_last_line(output)}")
 
 
 def _page(url: str) -> str:
-    """Return the page of the experiment used last, or the list of experiments."""
-    query = json.dumps({"max_results": 100, "order_by": ["last_update_time DESC"]}).encode()
-    address = f"{url}/api/2.0/mlflow/experiments/search"
-    request = urllib.request.Request(address, query, {"Content-Type": "application/json"})
+    """Return the address of the latest experiment, or of the list of experiments."""
+    query = {"max_results": 100, "order_by": ["last_update_time DESC"]}
+    found = _asked(f"{url}/api/2.0/mlflow/experiments/search", query).get("experiments", [])
+    ours = [str(e["experiment_id"]) for e in found if e.get("name") != "Default"]
+    if not ours:
+        return "/#/experiments?workflowType=machine_learning"
+    # The page reads the columns to show from a tag that its own button "Share" would set.
+    view = json.dumps({"selectedColumns": _COLUMNS})
+    tag = {"experiment_id": ours[0], "key": f"mlflow.sharedViewState.{_VIEW}", "value": view}
+    _asked(f"{url}/api/2.0/mlflow/experiments/set-experiment-tag", tag)
+    query = f"workflowType=machine_learning&viewStateShareKey={_VIEW}"
+    return f"/#/experiments/{ours[0]}/runs?{query}"
+
+
+def _asked(address: str, content: dict[str, Any]) -> dict[str, Any]:
+    """Return what MLflow answers; empty if it does not."""
+    headers = {"Content-Type": "application/json"}
+    request = urllib.request.Request(address, json.dumps(content).encode(), headers)
     try:
         with _DIRECT.open(request, timeout=30) as answer:
-            found = json.load(answer).get("experiments", [])
+            return json.load(answer)
     except (OSError, ValueError):
-        found = []
-    ours = [str(e["experiment_id"]) for e in found if e.get("name") != "Default"]
-    place = f"experiments/{ours[0]}/runs" if ours else "experiments"
-    return f"/#/{place}?workflowType=machine_learning"
+        return {}
 
 
 def _last_line(output: IO[bytes]) -> str:

@@ -1,4 +1,4 @@
-"""The flags of ``pgdm-run``, read before Hydra sees the command line."""
+"""The flags of ``pgdm-run``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SHORT = {
     "-sc": "--shell-completion",
 }
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
-# Flags with a value, and what it may be (None: anything).
+# Flags with a value, and its valid values (None: any).
 _VALUES: dict[str, tuple[str, ...] | None] = {
     "--cfg": ("job", "hydra", "all"),
     "--package": None,
@@ -28,25 +28,33 @@ _OURS = ("--help", "--version", "--debug", "--offline", "--dry-run")
 DRY_RUN = "sweep.dry_run=true"
 """What ``--dry-run`` means in a sweep."""
 _HYDRAS = ("--multirun", "--resolve", "--hydra-help", "--shell-completion")
+_PRINTING = {"--cfg", "--info", "--resolve", "--hydra-help", "--shell-completion"}
 
 
 @dataclass
 class Flags:
-    """What a command line asks for."""
+    """A command line, sorted."""
 
     ours: set[str] = field(default_factory=set)
-    """Those of ``_OURS`` that are there."""
+    """Those of ``_OURS`` that were given."""
     hydras: list[str] = field(default_factory=list)
-    """What Hydra gets of the flags, in its own form."""
+    """Flags for Hydra, in its own form."""
     overrides: list[str] = field(default_factory=list)
-    """Everything else: ``key=value``."""
+    """The overrides: ``key=value``."""
+    typed: list[str] = field(default_factory=list)
+    """Those that were typed; the others are from a sweep file."""
     config_dir: str | None = None
     """The user's own settings folder."""
 
     @property
     def multirun(self) -> bool:
-        """Whether several runs are asked for."""
-        return "--multirun" in self.hydras
+        """Whether the command line is a sweep."""
+        return "--multirun" in self.hydras or "hydra.mode=MULTIRUN" in self.overrides
+
+    @property
+    def prints(self) -> bool:
+        """Whether Hydra prints something instead of a run."""
+        return not _PRINTING.isdisjoint(self.hydras)
 
 
 def read_flags(arguments: Sequence[str]) -> Flags:

@@ -10,11 +10,32 @@ from typing import Annotated
 
 import typer
 
-from pgdm.cli import assets, author, dashboard, pregrasp, runs, sweep
-from pgdm.cli.errors import USAGE, check_environment, guarded, report
+from pgdm.cli import assets, dashboard, runs, sweep, zoo
+from pgdm.cli.author import commands as author
+from pgdm.cli.console.errors import USAGE, guarded, report
+from pgdm.cli.console.screen import loading
+from pgdm.cli.deploy import commands as deploy
+from pgdm.cli.options import (
+    EXPORTS,
+    Best,
+    Hand,
+    Offline,
+    Policy,
+    Run,
+    Start,
+    Task,
+    Video,
+    ZipSettings,
+    ZipStatistics,
+    ZipTask,
+    check_image,
+    known_runs,
+    one_of,
+)
+from pgdm.cli.pregrasp import commands as pregrasp
 from pgdm.errors import ConfigError
 
-# click's ClickException, which typer brings as a copy of its own in newer versions.
+# click's ClickException; newer versions of typer contain a copy of their own.
 _WRONG_USAGE: type[Exception] = typer.BadParameter.mro()[2]
 
 app = typer.Typer(
@@ -22,13 +43,16 @@ app = typer.Typer(
     help="Pre-Grasp informed Dexterous Manipulation. To train: pgdm-run --help.",
     no_args_is_help=True,
     rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
 app.add_typer(assets.app, name="assets")
 app.add_typer(pregrasp.app, name="pregrasp")
 app.add_typer(author.app, name="author")
+app.add_typer(deploy.app, name="deploy")
 app.add_typer(runs.app, name="runs")
 app.add_typer(sweep.app, name="sweep")
+app.add_typer(zoo.app, name="zoo")
 app.command("dashboard")(dashboard.dashboard)
 
 
@@ -41,9 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: list[str], debug: bool) -> int:
-    from pgdm.cli.run import set_up_logging
+    from pgdm.cli.console.logging_setup import set_up_logging
 
-    check_environment()
     set_up_logging(debug)
     command = typer.main.get_command(app)
     try:
@@ -56,11 +79,10 @@ def _main(arguments: list[str], debug: bool) -> int:
 
 
 def _report_usage(error: Exception, debug: bool) -> int:
-    form = getattr(error, "format_message", error.__str__)
+    text = getattr(error, "format_message", error.__str__)()
     if type(error).__name__ == "NoArgsIsHelpError":
-        print(form())  # the help
+        print(text)  # the help
         return USAGE
-    text = form()
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "pgdm"
     return report(ConfigError(f"{text.rstrip('.')}; see {command} --help"), debug)
@@ -84,72 +106,175 @@ def _options(
         ),
     ] = False,
 ) -> None:
-    del debug, version  # read before, and by its callback
+    del debug, version  # main and the callback have read them
 
 
 @app.command("eval")
 def evaluate(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="A run's folder, or a checkpoint file inside one.")
-    ],
+    policy: Policy,
     episodes: Annotated[
-        int | None, typer.Option(min=1, help="Episodes; by default as many as in the run.")
+        int | None, typer.Option(min=1, help="Number of episodes; by default that of the run.")
     ] = None,
-    video: Annotated[bool, typer.Option("--video", help="Film the policy too.")] = False,
-    deterministic: Annotated[
-        bool, typer.Option("--deterministic", help="Only the mean action, without noise.")
+    video: Annotated[
+        bool, typer.Option("--video", help="Also make a video of the policy.")
     ] = False,
-    best: Annotated[
-        bool, typer.Option("--best", help="Of a run: its best checkpoint, not its last.")
+    deterministic: Annotated[
+        bool, typer.Option("--deterministic", help="Measure only the mean action, without noise.")
+    ] = False,
+    best: Best = False,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="Seed of the noise; by default that of the run."),
+    ] = None,
+    task: ZipTask = None,
+    settings: ZipSettings = None,
+    vecnormalize: ZipStatistics = None,
+    offline: Offline = False,
+) -> None:
+    """Evaluate a trained policy.
+
+    A video of a run's policy goes into the run's folder, of any other into the current one.
+    """
+    with loading():
+        from pgdm.cli.evaluate import EvalRequest, evaluate_policy
+        from pgdm.cli.policies import PolicyRequest
+
+    which = PolicyRequest(policy, best, task, tuple(settings or ()), vecnormalize)
+    request = EvalRequest(which, episodes, video, deterministic, seed, offline)
+    raise typer.Exit(evaluate_policy(request))
+
+
+@app.command("export")
+def export_policy(
+    policy: Policy,
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="FORMAT",
+            help="torchscript, onnx, safetensors, or minari: episodes of the policy.",
+            callback=one_of("--format", lambda: EXPORTS),
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="File to write, or minari's folder of datasets [TASK with the format's ending; "
+            "datasets].",
+        ),
+    ] = None,
+    scene: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Also write the scene for plain MuJoCo into a new folder."
+        ),
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="Only minari: number of episodes [25].")
+    ] = None,
+    deterministic: Annotated[
+        bool, typer.Option("--deterministic", help="Only minari: take the mean action, no noise.")
     ] = False,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Of the noise; by default the run's.")
+        int | None, typer.Option(min=0, help="Only minari: seed of the noise [that of the run].")
     ] = None,
-    offline: Annotated[bool, typer.Option("--offline", help="Never use the network.")] = False,
+    best: Best = False,
+    task: ZipTask = None,
+    settings: ZipSettings = None,
+    vecnormalize: ZipStatistics = None,
+    offline: Offline = False,
 ) -> None:
-    """Measure a trained policy."""
-    from pgdm.cli.evaluate import EvalRequest, evaluate_policy
+    """Write a policy for use without pgdm, or episodes of it as a dataset."""
+    if form != "minari" and (episodes is not None or deterministic or seed is not None):
+        raise ConfigError("--episodes, --deterministic and --seed are for --format minari")
+    with loading():
+        from pgdm.cli.export import ExportRequest, export
+        from pgdm.cli.policies import PolicyRequest
 
-    request = EvalRequest(run, episodes, video, deterministic, best, seed, offline)
-    raise typer.Exit(evaluate_policy(request))
+    which = PolicyRequest(policy, best, task, tuple(settings or ()), vecnormalize)
+    request = ExportRequest(which, form, out, scene, episodes or 25, deterministic, seed, offline)
+    raise typer.Exit(export(request))
+
+
+@app.command()
+def resume(
+    run: Run,
+    total_frames: Annotated[
+        int | None, typer.Option(metavar="N", help="Train for this many frames, more than so far.")
+    ] = None,
+    time_limit_min: Annotated[
+        float | None,
+        typer.Option(min=0, metavar="MIN", help="Time limit over all attempts; 0: no limit."),
+    ] = None,
+    uri: Annotated[
+        str | None, typer.Option(help="MLflow store to mirror to, such as http://host:5000.")
+    ] = None,
+    offline: Offline = False,
+) -> None:
+    """Resume a stopped run with the settings in its folder."""
+    with loading():
+        from pgdm.cli.train import resume_run
+
+    raise typer.Exit(resume_run(run, total_frames, time_limit_min, uri, offline))
+
+
+@app.command()
+def compare(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN...", help="Folders of two or more runs.", callback=known_runs),
+    ],
+    image: Annotated[Path, typer.Option(help="PNG for the curves.", callback=check_image)] = Path(
+        "comparison.png"
+    ),
+) -> None:
+    """Compare runs: settings that differ, results, curves."""
+    with loading():
+        from pgdm.cli.compare import compare_runs
+
+    compare_runs(runs, image)
+
+
+@app.command()
+def doctor() -> None:
+    """Check this machine: versions, memory, rendering, library, MLflow, Slurm, GPU."""
+    with loading():
+        from pgdm.cli.doctor import diagnose
+
+    raise typer.Exit(diagnose())
 
 
 @app.command()
 def view(
-    task: Annotated[
-        str, typer.Argument(metavar="TASK", help="Such as hammer-use1; pgdm tasks lists them.")
-    ],
-    video: Annotated[
-        Path | None, typer.Option(help="Write an MP4 to this file instead of opening a window.")
-    ] = None,
-    pregrasp: Annotated[
-        str | None, typer.Option(help="Start that shows the hand, as in pgdm-run [planned].")
-    ] = None,
-    hand: Annotated[
-        str | None, typer.Option(help="Another hand than the task's: adroit, dhand or dmanus.")
-    ] = None,
+    task: Task,
+    video: Video = None,
+    pregrasp: Start = None,
+    hand: Hand = None,
     expert: Annotated[
         bool,
-        typer.Option("--expert", help="Move the hand as a person's moved; spheres show contacts."),
+        typer.Option("--expert", help="Move the hand as a person moved; spheres show contacts."),
     ] = False,
     reach: Annotated[
-        bool, typer.Option("--reach", help="Play the plan that brings the hand to its pre-grasp.")
+        bool,
+        typer.Option("--reach", help="Play the reach that brings the hand to its pre-grasp."),
     ] = False,
     wrist: Annotated[
-        bool, typer.Option("--wrist", help="Play the planned wrist: the hand alone, no object.")
+        bool, typer.Option("--wrist", help="Play the wrist plan: the hand alone, no object.")
     ] = False,
     ablations: Annotated[
         bool, typer.Option("--ablations", help="Show the start under each ablation instead.")
     ] = False,
     image: Annotated[
-        Path | None, typer.Option(help="With --ablations: write the pictures to this PNG.")
+        Path | None,
+        typer.Option(help="PNG for the pictures of --ablations.", callback=check_image),
     ] = None,
-    offline: Annotated[bool, typer.Option("--offline", help="Never use the network.")] = False,
+    offline: Offline = False,
 ) -> None:
-    """Replay a task's exemplar motion with the hand at its pre-grasp, or as a person moved it."""
-    from pgdm.cli.ablations import view_ablations
-    from pgdm.cli.view import view_expert, view_reach, view_task, view_wrist
+    """Show a task's motion, reach, wrist plan or expert hand.
 
+    By default the object moves along its exemplar motion, with the hand at its pre-grasp.
+    """
     if (ablations or image is not None) and (video is not None or expert or not ablations):
         raise ConfigError(
             "--ablations and --image FILE go together, without --video, --reach and --expert"
@@ -157,33 +282,36 @@ def view(
     if reach + wrist + ablations + expert > 1:
         raise ConfigError("--reach, --wrist, --ablations and --expert exclude each other")
     if expert and (pregrasp is not None or hand is not None):
-        raise ConfigError("--expert shows the hand as it moved: leave --pregrasp and --hand out")
-    start = pregrasp or "planned"
+        raise ConfigError("--expert shows a recorded hand: leave --pregrasp and --hand out")
+    with loading():
+        from pgdm.cli.ablations import view_ablations
+        from pgdm.cli.view import View, view_expert, view_reach, view_task, view_wrist
+
+    what = View(task, hand, video, pregrasp or "planned", offline)
     if ablations:
-        return view_ablations(task, hand, image, start, offline)
-    if wrist:
-        return view_wrist(task, hand, video, start, offline)
-    if reach:
-        return view_reach(task, hand, video, start, offline)
-    if expert:
-        return view_expert(task, video, offline)
-    return view_task(task, hand, video, start, offline)
+        view_ablations(what, image)
+        return
+    play = view_wrist if wrist else view_reach if reach else view_expert if expert else view_task
+    play(what)
 
 
 @app.command("report")
 def write_report(
     places: Annotated[
         list[str],
-        typer.Argument(metavar="DIR...", help="Folders of runs, or an MLflow experiment's name."),
+        typer.Argument(metavar="DIR...", help="Folders of runs, or names of MLflow experiments."),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write into [DIR/report].", metavar="FOLDER")
+        Path | None, typer.Option(help="Folder to write to [DIR/report].", metavar="FOLDER")
     ] = None,
     uri: Annotated[
-        str | None, typer.Option(help="MLflow store with the experiment [runs/mlflow.db].")
+        str | None, typer.Option(help="The MLflow store of the experiments [runs/mlflow.db].")
     ] = None,
 ) -> None:
-    """Set runs beside the paper: one page, tables and pictures."""
+    """Compare runs with the paper on one page.
+
+    Its tables and plots are also written as files.
+    """
     from pgdm.cli.report import make_report
 
     make_report(places, out, uri)
@@ -192,7 +320,7 @@ def write_report(
 @app.command()
 def tasks(
     tcdm30: Annotated[
-        bool, typer.Option("--tcdm30", help="Only the 30 tasks of the paper's comparisons.")
+        bool, typer.Option("--tcdm30", help="List only the 30 tasks of the paper's comparisons.")
     ] = False,
 ) -> None:
     """List the tasks."""

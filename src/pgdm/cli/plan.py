@@ -1,87 +1,65 @@
-"""A sweep before it starts: planned, shown, and handed to its launcher."""
+"""A sweep before it starts: planned, shown, and passed to its launcher."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Sequence
 
-from rich.console import Console
 from rich.table import Table
 
 from pgdm import paths
-from pgdm.cli.compose import Composed
-from pgdm.cli.train import notify
+from pgdm.cli.console.screen import bars, notify, tables
+from pgdm.cli.console.sweep_table import span
+from pgdm.cli.jobs import Asked
+from pgdm.cli.sweep import FRONT
+from pgdm.config.groups import GROUPS
 from pgdm.config.strict import build
-from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.library import open_library
+from pgdm.runs.config_file import dotted
 from pgdm.sweep.estimate import Estimate, estimate
 from pgdm.sweep.foresee import foresee
 from pgdm.sweep.launch import run_sweep
-from pgdm.sweep.plan import LAUNCHERS, LauncherCfg, LocalCfg, Plan, SweepCfg, check_fits
+from pgdm.sweep.plan import Plan, SweepCfg, check_fits, read_launcher
 from pgdm.sweep.planning import make_plan
 
-_WIDE = 200  # columns where nobody's terminal sets them
 _MOST_NOTES = 3
 
 
-def run_planned(composed: Composed, name: str, command: str) -> int:
-    """Plan a sweep, show the plan, do it, and return the exit code.
+def run_planned(asked: Asked, name: str, command: str) -> int:
+    """Plan a sweep, show the plan, carry it out, and return the exit code.
 
     Args:
-        composed: its jobs.
+        asked: its jobs.
         name: its name if ``sweep.name`` has none.
         command: what was typed.
 
     Raises:
         PgdmError: if a job's settings are wrong, or the sweep's folder holds another sweep.
     """
-    sweep = build(SweepCfg, composed.jobs[0][1].sweep, "sweep")
-    launcher = _launcher(composed)
-    plan, notes = make_plan(composed.jobs, sweep, name, command)
-    check_fits(plan)
+    sweep = build(SweepCfg, asked.jobs[0][1].get("sweep"), "sweep")
+    launcher = read_launcher(asked.launcher_choice, asked.launcher)
+    with bars(patience_s=2.0) as progress:
+        plan, notes = make_plan(asked.jobs, sweep, name, command, progress)
+        check_fits(plan)
+        expected = foresee([job.cfg for job in plan.jobs], open_library(), progress)
+        cost = estimate(plan, paths.runs(), progress)
     for note in [*notes[:_MOST_NOTES], *(["..."] if len(notes) > _MOST_NOTES else [])]:
         notify(f"note: {note}")
-    for note in foresee((job.cfg for job in plan.jobs), open_library()):
+    for note in expected:
         notify(f"note: {note}")
-    _show(plan, estimate(plan, paths.runs()))
+    _show(plan, cost)
     if sweep.dry_run:
         print("nothing was started (sweep.dry_run)")
         return 0
-    return run_sweep(plan, sweep, launcher, notify)
-
-
-def _launcher(composed: Composed) -> LauncherCfg:
-    choice = composed.launcher_choice
-    if choice not in LAUNCHERS:
-        raise UnknownNameError("hydra/launcher of pgdm", choice, LAUNCHERS)
-    launcher: LauncherCfg = build(LAUNCHERS[choice], composed.launcher, "hydra.launcher")
-    least = (
-        {"max_jobs": 0, "cores_per_job": 0}
-        if isinstance(launcher, LocalCfg)
-        else {"time_min": 1, "cores_per_job": 1, "signal_delay_s": 1, "poll_s": 1}
-        | {"gpus_per_job": 0, "array_parallelism": 0}
-    )
-    for key, bound in least.items():
-        if (value := getattr(launcher, key)) < bound:
-            raise ConfigError(f"hydra.launcher.{key} is {value}; it must be at least {bound}")
-    if (memory := launcher.memory_per_job_gb) <= 0:
-        raise ConfigError(f"hydra.launcher.memory_per_job_gb is {memory}; it must be above 0")
-    if not isinstance(launcher, LocalCfg) and launcher.signal_delay_s >= 60 * launcher.time_min:
-        raise ConfigError(
-            f"hydra.launcher.signal_delay_s is {launcher.signal_delay_s}, and the time limit "
-            f"time_min only {launcher.time_min} minutes; choose a longer one"
-        )
-    return launcher
+    return run_sweep(plan, sweep, launcher, FRONT)
 
 
 def _show(plan: Plan, cost: Estimate) -> None:
-    console = Console() if sys.stdout.isatty() else Console(width=_WIDE)
     table = Table(box=None, show_header=False, title=f"sweep {plan.name}", title_justify="left")
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     for key, value in _rows(plan, cost):
         table.add_row(key, value)
-    console.print(table, markup=False)
+    tables().print(table, markup=False)
     # Not through rich: a path must stay whole on its line.
     print(f"folder: {plan.folder}")
 
@@ -89,14 +67,11 @@ def _show(plan: Plan, cost: Estimate) -> None:
 def _rows(plan: Plan, cost: Estimate) -> list[tuple[str, str]]:
     cfgs = [job.cfg for job in plan.jobs]
     tasks = _each(cfg.task.id for cfg in cfgs)
+    flat = [dotted(cfg) for cfg in cfgs]
     choices = {
-        "method": [cfg.method.name for cfg in cfgs],
-        "ablation": [cfg.ablation.name for cfg in cfgs],
-        "pregrasp": [cfg.pregrasp.source for cfg in cfgs],
-        "algo": [cfg.algo.name for cfg in cfgs],
-        "action": [cfg.action.kind for cfg in cfgs],
-        "obs": [cfg.obs.layout for cfg in cfgs],
-        "budget": [cfg.budget for cfg in cfgs],
+        group: _each(settings[key] for settings in flat)
+        for group, key in {**GROUPS, "budget": "budget"}.items()
+        if group not in ("reference", "hand")
     }
     state = [f"{cost.finished} finished", f"{cost.begun} begun"]
     total = sum(cfg.total_frames for cfg in cfgs)
@@ -105,7 +80,7 @@ def _rows(plan: Plan, cost: Estimate) -> list[tuple[str, str]]:
     source = (
         f"{speed}, measured in {cost.measured_runs} earlier runs"
         if cost.measured_runs
-        else f"{speed}, which is assumed: no earlier run like these lies in {paths.runs()}"
+        else f"{speed}, which is assumed: there is no earlier run like these"
     )
     disk = max(cfg.total_frames * cfg.algo.usual_frame_bytes for cfg in cfgs) / 1e9
     kept = "kept" if any(cfg.keep_replay for cfg in cfgs) else "until it has finished"
@@ -114,10 +89,13 @@ def _rows(plan: Plan, cost: Estimate) -> list[tuple[str, str]]:
         ("jobs", f"{len(cfgs)} ({', '.join(state)})"),
         ("tasks", f"{len(tasks)}: {_some(tasks)}"),
         ("seeds", _some(_each(str(cfg.seed) for cfg in cfgs))),
-        ("settings", ", ".join(f"{k} {'|'.join(_each(v))}" for k, v in choices.items())),
+        ("settings", ", ".join(f"{k} {'|'.join(v)}" for k, v in choices.items())),
         ("differ in", _some(_differing(plan))),
-        ("frames", f"{lengths} a job, {total:,} in all, {cost.frames_left:,} to do"),
-        ("time", f"about {_span(cost.hours)} of training, one job after the other at {source}"),
+        ("frames", f"{lengths} a job, {total:,} in all, {cost.frames_left:,} left"),
+        (
+            "time",
+            f"about {span(3600 * cost.hours)} of training, one job after the other at {source}",
+        ),
         *(replay if disk else []),
     ]
 
@@ -136,7 +114,3 @@ def _each(values: Iterable[str]) -> list[str]:
 def _some(values: Sequence[str]) -> str:
     shown = values if len(values) <= 6 else [*values[:5], f"... {values[-1]}"]
     return ", ".join(shown)
-
-
-def _span(hours: float) -> str:
-    return f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.0f} minutes"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 import sys
 from collections.abc import Sequence
 
-from pgdm.cli.compose import compose_all
-from pgdm.cli.errors import check_environment, guarded
+from pgdm.cli.console.errors import USAGE, guarded
 from pgdm.cli.flags import Flags, read_flags
+from pgdm.cli.jobs import read_jobs
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -21,59 +20,58 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _main(flags: Flags, command: str, debug: bool) -> int:
-    if "--help" in flags.ours:
+    asks_nothing = not flags.overrides and not flags.hydras and not flags.ours - {"--debug"}
+    if "--help" in flags.ours or asks_nothing:
         from pgdm.cli.help import help_text
 
         print(help_text(flags.config_dir))
-        return 0
+        return USAGE if asks_nothing else 0
     if "--version" in flags.ours:
         from importlib.metadata import version
 
         print(f"pgdm {version('pgdm')}")
         return 0
-    check_environment()
+    from pgdm.config.foreign import check_method, named_methods, trust_method
+    from pgdm.config.groups import own_folders
     from pgdm.sweep.studies import default_name, open_study
 
     study, typed, written = open_study(flags.overrides, flags.config_dir)
-    flags.overrides = [*written, *typed]
+    flags.overrides, flags.typed = [*written, *typed], typed
     if study is not None and not flags.multirun:
         flags.hydras.append("--multirun")
-    composed = compose_all(flags)
-    if not composed.jobs:
-        return 0
-    # Here: they load the simulator and torch, and a wrong name should be answered before that.
-    from pgdm.cli.plan import run_planned
-    from pgdm.cli.train import show, train
-    from pgdm.config.store import from_dict_config
-    from pgdm.experiment import foreseen
-    from pgdm.library import open_library
+    from pgdm.cli.console.logging_setup import set_up_logging
+    from pgdm.cli.console.screen import bars, loading
 
+    with bars(patience_s=2.0) as progress:
+        asked = read_jobs(flags, progress)
+    if not asked.jobs:
+        return 0
     set_up_logging(debug)
-    if composed.is_sweep:
-        return run_planned(composed, default_name(typed, study), command)
-    cfg = from_dict_config(composed.jobs[0][1])
+    named = named_methods(typed, own_folders(flags.config_dir))
+    for _, settings in asked.jobs:
+        if (settings.get("method") or {}).get("name") in named:
+            trust_method(settings)
+        check_method(settings, "a settings file")
+    # Only here: they load the simulator and torch, and a wrong name is answered before that.
+    if asked.is_sweep:
+        with loading():
+            from pgdm.cli.plan import run_planned
+
+        return run_planned(asked, default_name(typed, study), command)
+    with loading():
+        from pgdm.cli.train import show, train
+        from pgdm.config.compose import checked
+        from pgdm.experiment import foreseen
+        from pgdm.library import open_library
+        from pgdm.tracking import located
+
+    cfg = checked(asked.jobs[0][1])
     if "--dry-run" in flags.ours:
-        show(cfg, foreseen(cfg, open_library()))
+        notes: list[str] = []
+        located(cfg.tracking, notes.append)
+        with bars(patience_s=2.0) as progress:
+            progress("compiling the scene", 0, 1)
+            notes += foreseen(cfg, open_library())
+        show(cfg, notes)
         return 0
     return train(cfg)
-
-
-class _NoticeHandler(logging.Handler):
-    """Prints as ``notify`` does, above the live line of progress and not into it."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        from pgdm.cli.train import notify
-
-        notify(self.format(record))
-
-
-def set_up_logging(debug: bool) -> None:
-    """Send what modules log to stderr, each as one line."""
-    handler = _NoticeHandler()
-    logging.basicConfig(
-        format="%(levelname)s: %(message)s", level=logging.WARNING, handlers=[handler]
-    )
-    logging.getLogger("pgdm").setLevel(logging.DEBUG if debug else logging.WARNING)
-    # Warnings of libraries are for developers.
-    logging.captureWarnings(True)
-    logging.getLogger("py.warnings").setLevel(logging.WARNING if debug else logging.ERROR)

@@ -1,27 +1,30 @@
-"""``pgdm runs``: what lies in a folder of runs, and MLflow rebuilt from it."""
+"""``pgdm runs``: list and remove the runs in a folder, and rebuild MLflow from them."""
 
 from __future__ import annotations
 
+import fnmatch
+import itertools
 import json
 import math
-import sys
+import shutil
 import time
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from typer.core import TyperGroup
 
 from pgdm import paths
-from pgdm.cli.sweep import settled
-from pgdm.errors import RunError
-from pgdm.tracking.run_folder import RunFolder, find_runs
-from pgdm.tracking.run_log import metrics_of
+from pgdm.cli.console.screen import bars, confirmed, fits, tables
+from pgdm.cli.options import Runs
+from pgdm.errors import ConfigError, RunError, UnknownNameError
+from pgdm.runs.folder import RunFolder, claimed, find_runs, folder_of, located
+from pgdm.runs.log import metrics_of
 
-_WIDE = 200  # columns where nobody's terminal sets them: in a file or a pipe nothing is cut
 _UNKNOWN = "-"
 _COLOURS = {"running": "cyan", "finished": "green", "interrupted": "yellow", "failed": "red"}
 
@@ -44,38 +47,95 @@ _COLUMNS = {
 }
 
 
+# In a narrow terminal the first of these are left out; each run's name, below it, has most of them.
+_NEEDLESS = ("action", "algo", "start", "method", "steps/s", "lifted", "error", "when", "seed")
+
+
 class _ListByDefault(TyperGroup):
-    """``runs DIR`` is ``runs list DIR``: a first word that is no command is a folder."""
+    """``runs DIR`` is ``runs list DIR``: a first word that is not a command is a folder."""
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        if not args or (args[0] not in self.commands and args[0] != "--help"):
+        if not args or (args[0] not in self.commands and args[0] not in ("-h", "--help")):
             args = ["list", *args]
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer(cls=_ListByDefault, help="Show local runs; `sync` rebuilds MLflow from them.")
+app = typer.Typer(cls=_ListByDefault, help="List or remove runs, or rebuild MLflow from them.")
 
-Root = Annotated[Path | None, typer.Argument(metavar="DIR", help="Folder of runs [runs].")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON for programs, not a table.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 Uri = Annotated[str | None, typer.Option(help="MLflow store to fill, such as http://host:5000.")]
 
 
+Where = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="COLUMN=VALUE",
+        help="List only runs like task=cup* or status=failed; can be repeated.",
+    ),
+]
+Sort = Annotated[
+    str,
+    typer.Option(metavar="COLUMN", help="Sort by it, the largest last; -COLUMN: first."),
+]
+Limit = Annotated[
+    int | None, typer.Option("--limit", "-n", min=1, help="List only the N largest, or latest.")
+]
+
+
 @app.command("list")
-def list_runs(root: Root = None, as_json: AsJson = False) -> None:
-    """Show a folder's runs, the latest last (`pgdm runs [DIR]` does this)."""
-    root = _existing(root)
-    rows = sorted((row(folder, root) for folder in find_runs(root)), key=lambda r: r["modified"])
+def list_runs(
+    root: Runs = None,
+    where: Where = None,
+    sort: Sort = "when",
+    limit: Limit = None,
+    as_json: AsJson = False,
+) -> None:
+    """List a folder's runs, the latest last; same as `pgdm runs [DIR]`."""
+    root, matches, order = _existing(root), _matcher(where or ()), _order(sort)
+    folders, rows = find_runs(root), []
+    with bars(patience_s=2.0) as progress:
+        for folder in folders:
+            progress("reading runs", len(rows), len(folders))
+            rows.append(row(folder, root))
+    found, count = len(rows), limit or len(rows)
+    rows = sorted(filter(matches, rows), key=order)[-count:]
+    rows = rows[::-1] if sort.startswith("-") else rows
     if as_json:
         print(json.dumps(rows, indent=1))
     elif rows:
-        _console().print(_table(rows))
+        _print(rows)
+    elif found:
+        print(f"none of the {found} runs in {root} has {', '.join(where or ())}")
     else:
         print(f"no runs in {root}; `pgdm-run` starts one")
 
 
+@app.command("remove")
+def remove_runs(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs.")],
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
+) -> None:
+    """Remove runs with all their files; this cannot be undone."""
+    folders = [RunFolder(folder_of(path)) for path in runs]
+    for path, folder in zip(map(located, runs), folders, strict=True):
+        if path.is_file() or folder.path.is_symlink():
+            raise RunError(f"'{path}' is a link, or a file in a run; name the run's own folder")
+        if folder.status() == "running":
+            raise RunError(f"'{folder.path}' is running; stop it first")
+    names = ", ".join(str(folder.path) for folder in folders)
+    if not yes and not confirmed(f"remove {names}? This cannot be undone"):
+        print("nothing was removed")
+        return
+    for folder in folders:
+        with claimed(folder.path):
+            shutil.rmtree(folder.path)
+        print(f"removed {folder.path}")
+
+
 @app.command("sync")
-def sync_runs(root: Root = None, uri: Uri = None) -> None:
-    """Make MLflow show each run of a folder as the folder's own records do."""
+def sync_runs(root: Runs = None, uri: Uri = None) -> None:
+    """Bring MLflow up to date with the run folders."""
+    from pgdm.cli.sweep import settled
     from pgdm.tracking.sync import Synced, sync
 
     root = _existing(root)
@@ -91,11 +151,11 @@ def sync_runs(root: Root = None, uri: Uri = None) -> None:
 
 
 def row(folder: RunFolder, root: Path) -> dict[str, Any]:
-    """Return what a table shows of a run; None where it is not known.
+    """Return the values of a run that the table shows; None if unknown.
 
     Args:
-        folder: the run. One that cannot be read gets the status ``unreadable``.
-        root: the folder of runs, to name the run in it.
+        folder: the run; if it cannot be read, its status is ``unreadable``.
+        root: the folder of runs, which the run's name is relative to.
     """
     base = {"run": _relative(folder, root), "modified": folder.modified()}
     try:
@@ -111,7 +171,7 @@ def row(folder: RunFolder, root: Path) -> dict[str, Any]:
     named = ("success", "com_error_released", "lifted")
     return {
         **{key: tags.get(key) for key in ("task", "hand", "method", "algo", "action")},
-        # What the run itself found where it was asked for, else what was asked for.
+        # The source that was used, or the requested one if the run did not record it.
         "start": tags.get("pregrasp_used", tags.get("pregrasp_source")),
         "ablation": tags.get("ablation"),
         "seed": folder.setting("seed"),
@@ -123,17 +183,79 @@ def row(folder: RunFolder, root: Path) -> dict[str, Any]:
     }
 
 
-def _table(rows: list[dict[str, Any]]) -> Table:
+def _key(column: str) -> str:
+    """Return the key in a row of a column, by its head or by the key itself.
+
+    Raises:
+        UnknownNameError: if there is no such column.
+    """
+    keys = {name: key for name, (key, _) in _COLUMNS.items()} | {"when": "modified"}
+    keys |= {key: key for key in (*keys.values(), "hand", "ablation")}
+    if column not in keys:
+        raise UnknownNameError("column", column, keys)
+    return keys[column]
+
+
+def _matcher(where: Sequence[str]) -> Callable[[dict[str, Any]], bool]:
+    """Return whether a row has the values that texts such as ``task=cup*`` demand."""
+    wanted = []
+    for text in where:
+        column, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"cannot read '{text}'; write COLUMN=VALUE, such as status=failed")
+        wanted.append((_key(column), value))
+    return lambda found: all(
+        fnmatch.fnmatchcase(_cell(found.get(key), None), value) for key, value in wanted
+    )
+
+
+def _order(sort: str) -> Callable[[dict[str, Any]], Any]:
+    """Return what rows are sorted by; those without the value come first."""
+    key = _key(sort.removeprefix("-"))
+
+    def order(found: dict[str, Any]) -> tuple[bool, bool, Any]:
+        value = found.get(key)
+        is_text = not isinstance(value, int | float)
+        return value is not None, is_text, str(value) if is_text else value
+
+    return order
+
+
+def _print(rows: list[dict[str, Any]]) -> None:
+    console = tables()
+    columns = list(_COLUMNS)
+    table = _table(rows, columns)
+    if fits(console, table):
+        console.print(table)
+        return
+    columns.remove("run")
+    for name in ("", *_NEEDLESS):
+        columns = [column for column in columns if column != name]
+        table = _table(rows, columns)
+        if fits(console, table):
+            break
+    with console.capture() as capture:
+        console.print(table)
+    head, *lines = capture.get().splitlines()
+    console.print(Text.from_ansi(head))
+    for line, values in itertools.zip_longest(lines, rows, fillvalue=None):
+        console.print(Text.from_ansi(line or ""))
+        if values:  # uncut: to be copied into a command
+            print(f"  {values['run']}", flush=True)
+
+
+def _table(rows: list[dict[str, Any]], columns: Sequence[str]) -> Table:
     caption = "success (within 1 cm), error (released form, m), lifted: last evaluation, sampled"
     table = Table(caption=caption, box=None, header_style="bold", caption_justify="left")
-    for name, (_, form) in _COLUMNS.items():
+    chosen = {name: _COLUMNS[name] for name in columns}
+    for name, (_, form) in chosen.items():
         table.add_column(name, justify="right" if form else "left", overflow="fold")
     for values in rows:
         shown = {**values, "when": _ago(time.time() - values["modified"])}
         if values.get("ablation") not in (None, "none"):
             shown["start"] = f"{values['start']} {values['ablation']}"
-        cells = [_cell(shown.get(key), form) for key, form in _COLUMNS.values()]
-        status = list(_COLUMNS).index("status")
+        cells = [_cell(shown.get(key), form) for key, form in chosen.values()]
+        status = list(chosen).index("status")
         colour = _COLOURS.get(values["status"], "red")
         cells[status] = f"[{colour}]{values['status']}[/]"
         table.add_row(*cells)
@@ -170,7 +292,3 @@ def _existing(root: Path | None) -> Path:
         hint = "`pgdm-run` makes one" if root is None else "name a folder that holds runs"
         raise RunError(f"there is no folder '{chosen}'; {hint}")
     return chosen
-
-
-def _console() -> Console:
-    return Console() if sys.stdout.isatty() else Console(width=_WIDE)

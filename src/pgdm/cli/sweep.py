@@ -1,4 +1,4 @@
-"""``pgdm sweep``: sweeps that run or have ended, from any shell."""
+"""``pgdm sweep``: follow and control sweeps, running or ended, from any shell."""
 
 from __future__ import annotations
 
@@ -8,20 +8,24 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pgdm.cli.errors import INTERRUPTED as INTERRUPTED_CODE
+from pgdm import files
+from pgdm.cli import worker
+from pgdm.cli.console.errors import INTERRUPTED as INTERRUPTED_CODE
+from pgdm.cli.console.screen import notify, tables
+from pgdm.cli.console.sweep_table import SweepView, percent, span, summary_line
 from pgdm.errors import SweepError, UnknownNameError
+from pgdm.sweep.front import Front
 from pgdm.sweep.ledger import (
     CANCELLED,
     FAILED,
-    FILE,
     FINISHED,
     INTERRUPTED,
     RUNNING,
@@ -29,11 +33,10 @@ from pgdm.sweep.ledger import (
     Entry,
     Ledger,
 )
-from pgdm.sweep.mirror import SweepMirror
 from pgdm.sweep.queue import Queue
 from pgdm.sweep.queue import cancel as cancel_in_slurm
-from pgdm.sweep.state import NAME, SLOTS, Row, log_path, parent, rows, settle, summarize
-from pgdm.sweep.view import SweepView, failures, percent, span, summary_line
+from pgdm.sweep.repair import repaired
+from pgdm.sweep.status import NAME, SLOTS, Row, log_path, parent, rows, summarize
 
 _COLOURS = {
     RUNNING: "cyan",
@@ -42,20 +45,26 @@ _COLOURS = {
     INTERRUPTED: "yellow",
     CANCELLED: "magenta",
 }
-_PLAN = "plan.json"  # pgdm.sweep.plan knows it too, and loads torch
-_WIDE = 200  # columns where nobody's terminal sets them
 _POLL_S = 0.5
 _STOP_S = 120.0
 _ASK_S = 2.0
 
-app = typer.Typer(help="Look after a sweep: see it, end it, go on with it.", no_args_is_help=True)
+FRONT = Front(
+    notify,
+    SweepView,
+    worker=worker.COMMAND,
+    resume=(sys.executable, "-m", "pgdm", "sweep", "resume"),
+)
+"""What every sweep gets of the command line."""
+
+app = typer.Typer(help="Follow, stop and resume sweeps.", no_args_is_help=True)
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the sweep.")]
 Jobs = Annotated[
     list[str] | None,
     typer.Argument(metavar="[JOB]...", help="Jobs, by a part of their name or by their key."),
 ]
-Detach = Annotated[bool, typer.Option("--detach", help="Go on in the background.")]
+Detach = Annotated[bool, typer.Option("--detach", help="Run in the background.")]
 
 
 @app.command()
@@ -63,7 +72,10 @@ def status(
     folder: Folder,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON for programs.")] = False,
 ) -> None:
-    """Show each job: state, frames, success, attempts, time left; and all of it in one line."""
+    """Show each job and the whole sweep.
+
+    Of each job: state, frames, success, attempts, time left.
+    """
     queue = Queue()
     ledger = settled(folder, queue)
     found = rows(ledger, queue)
@@ -73,30 +85,29 @@ def status(
         jobs = [dataclasses.asdict(row) for row in found]
         print(json.dumps({**whole, **dataclasses.asdict(summary), "jobs": jobs}, default=str))
         return
-    console = Console() if sys.stdout.isatty() else Console(width=_WIDE)
-    console.print(_table(found))
+    tables().print(_table(found))
     print(summary_line(ledger.fact(NAME) or folder.name, summary))
     left = [row for row in found if row.state in (WAITING, INTERRUPTED) and row.slurm is None]
     if parent(ledger) is None and left:
-        print(f"nobody works on it; pgdm sweep resume {folder} goes on")
+        print(f"no process drives it; pgdm sweep resume {folder} continues")
 
 
 @app.command()
 def watch(folder: Folder) -> None:
-    """Follow a sweep until it ends; Ctrl-C only ends the watching."""
+    """Follow a sweep until it ends; Ctrl-C stops only the display."""
     queue = Queue()
     ledger = settled(folder, queue)
     try:
         with SweepView(ledger.fact(NAME) or folder.name, ledger, queue) as view:
-            while parent(ledger) is not None or _goes_on(rows(ledger, queue)):
+            while parent(ledger) is not None or _continues(rows(ledger, queue)):
                 view.update()
                 time.sleep(_POLL_S)
     except KeyboardInterrupt:
-        print(f"the sweep goes on; pgdm sweep cancel {folder} ends it", file=sys.stderr)
+        print(f"the sweep continues; pgdm sweep cancel {folder} stops it", file=sys.stderr)
         raise typer.Exit(INTERRUPTED_CODE) from None
     settled(folder, queue)
     print(view.line())
-    if text := failures(rows(ledger, queue)):
+    if text := view.failures():
         print(text)
     raise typer.Exit(int(any(state != FINISHED for state in ledger.states().values())))
 
@@ -105,31 +116,33 @@ def watch(folder: Folder) -> None:
 def logs(
     folder: Folder,
     job: Annotated[str, typer.Argument(metavar="JOB", help="A part of its name, or its key.")],
-    follow: Annotated[bool, typer.Option("-f", "--follow", help="Go on until it ends.")] = False,
+    follow: Annotated[
+        bool, typer.Option("-f", "--follow", help="Follow it until the job ends.")
+    ] = False,
 ) -> None:
-    """Print what a job's last attempt printed."""
+    """Print the output of a job's last attempt."""
     queue = Queue()
     ledger = settled(folder, queue)
     entry = _one(ledger.entries(), job)
     path = log_path(ledger.folder, entry.name, 0 if entry.last is None else entry.last.number)
     if not path.exists():
         raise SweepError(f"{entry.name} has not been started yet")
-    with open(path, errors="replace") as log:
+    with TextIOWrapper(files.open_file(path), errors="replace") as log:
         while True:
-            # Asked before reading: what it wrote last is then there.
-            goes_on = follow and any(
+            # Queried before reading, so that its last output is not missed.
+            continues = follow and any(
                 r.key == entry.key and r.state == RUNNING for r in rows(ledger, queue)
             )
             while text := log.read(1 << 16):
                 print(text, end="", flush=True)
-            if not goes_on:
+            if not continues:
                 return
             time.sleep(_POLL_S)
 
 
 @app.command()
 def cancel(folder: Folder, jobs: Jobs = None) -> None:
-    """Stop jobs, or all that are not finished: running ones save what they have reached."""
+    """Stop jobs, or all that are not finished; running ones save first."""
     queue = Queue(_ASK_S)
     ledger = settled(folder, queue)
     ended = (FINISHED, FAILED) if not jobs else (FINISHED,)
@@ -146,35 +159,41 @@ def cancel(folder: Folder, jobs: Jobs = None) -> None:
         if time.monotonic() > limit:
             raise SweepError(f"not all have stopped yet; see pgdm sweep status {folder}")
         time.sleep(_POLL_S)
-    print(f"cancelled {len(chosen)} jobs; pgdm sweep resume {folder} would go on with them")
+    print(f"cancelled {len(chosen)} jobs; pgdm sweep resume {folder} would resume them")
 
 
 @app.command()
 def retry(folder: Folder, jobs: Jobs = None) -> None:
-    """Try failed jobs again, or the named ones: here, or by who drives the sweep now."""
+    """Retry failed jobs.
+
+    Named jobs instead, if any, unless they have finished. They run here, or in the process that
+    drives the sweep.
+    """
     ledger = settled(folder)
     wanted = _chosen(ledger, jobs)
     chosen = [e for e in wanted if e.state == FAILED or (jobs and e.state != FINISHED)]
     chosen = [e for e in chosen if e.state != RUNNING]
     if not chosen:
-        print("no failed jobs" if not jobs else "nothing to try again: finished or running")
+        print("no failed jobs" if not jobs else "nothing to retry: finished or running")
         return
     if parent(ledger) is not None:
         ledger.set_states({entry.key: WAITING for entry in chosen})
-        print(f"{len(chosen)} jobs will be tried again by the sweep that runs")
+        print(f"{len(chosen)} jobs will be retried by the running sweep")
         return
-    raise typer.Exit(_go_on(folder, keys={entry.key for entry in chosen}))
+    raise typer.Exit(_resume(folder, keys={entry.key for entry in chosen}))
 
 
 @app.command()
 def resume(folder: Folder, detach: Detach = False) -> None:
-    """Go on with all that is not finished, as the sweep was started; needs no other settings."""
+    """Resume unfinished jobs.
+
+    The settings are those that the sweep was started with.
+    """
     settled(folder)
-    raise typer.Exit(_go_on(folder, detach=detach))
+    raise typer.Exit(_resume(folder, detach=detach))
 
 
-def _go_on(folder: Path, detach: bool = False, keys: set[str] | None = None) -> int:
-    from pgdm.cli.train import notify
+def _resume(folder: Path, detach: bool = False, keys: set[str] | None = None) -> int:
     from pgdm.sweep.launch import launched, run_sweep
     from pgdm.sweep.plan import read_plan
 
@@ -183,37 +202,21 @@ def _go_on(folder: Path, detach: bool = False, keys: set[str] | None = None) -> 
         jobs = tuple(job for job in plan.jobs if job.key in keys)
         plan = dataclasses.replace(plan, jobs=jobs)
     sweep, launcher = launched(plan)
-    return run_sweep(plan, dataclasses.replace(sweep, detach=detach), launcher, notify)
+    return run_sweep(plan, dataclasses.replace(sweep, detach=detach), launcher, FRONT)
 
 
 def settled(folder: Path, queue: Queue | None = None) -> Ledger:
-    """Return a sweep's ledger, brought to the truth, and MLflow with it."""
-    if not (folder / _PLAN).exists():
-        raise SweepError(f"'{folder}' holds no sweep: it has no {_PLAN}")
-    missing = not (folder / FILE).exists()
-    ledger = Ledger(folder)
-    if missing:
-        from pgdm.sweep.driver import recall
-        from pgdm.sweep.plan import read_plan
-
-        recall(ledger, read_plan(folder))
-    if parent(ledger) is not None:
-        return ledger  # it sees to all that itself
-    closed = settle(ledger, queue)
-    whole = all(state == FINISHED for state in ledger.states().values())
-    dead = [entry.run_dir for entry in closed]
-    status = FINISHED if whole else INTERRUPTED
-    SweepMirror.set_right(ledger.folder, dead, status, lambda text: print(text, file=sys.stderr))
-    return ledger
+    """Return a sweep's ledger, repaired; see ``pgdm.sweep.repair``."""
+    return repaired(folder, queue, lambda text: print(text, file=sys.stderr))
 
 
-def _goes_on(found: Sequence[Row]) -> bool:
-    """Return whether Slurm has jobs of a sweep that run, or will, without anybody driving it."""
+def _continues(found: Sequence[Row]) -> bool:
+    """Return whether Slurm runs jobs of a sweep, or will, without a driver."""
     return any(row.slurm is not None and row.state in (WAITING, RUNNING) for row in found)
 
 
 def _chosen(ledger: Ledger, jobs: Sequence[str] | None) -> list[Entry]:
-    """Return the jobs that are meant; all if none is named.
+    """Return the named jobs; all if none is named.
 
     Raises:
         UnknownNameError: if a text is in no job's name.
@@ -230,7 +233,9 @@ def _one(entries: Sequence[Entry], text: str) -> Entry:
         raise UnknownNameError("job", text, [entry.name for entry in entries])
     if len(found) > 1:
         some = ", ".join(entry.name for entry in found[:3])
-        raise SweepError(f"'{text}' is in the names of {len(found)} jobs: {some}; write more of it")
+        raise SweepError(
+            f"'{text}' is in the names of {len(found)} jobs: {some}; give more of the name"
+        )
     return found[0]
 
 
@@ -240,7 +245,7 @@ def _table(found: Sequence[Row]) -> Table:
     table.add_column("state")
     for head in ("frames", "success", "attempts", "left"):
         table.add_column(head, justify="right")
-    table.add_column("error, or what Slurm says", overflow="fold")
+    table.add_column("error, or state in Slurm", overflow="fold")
     for row in found:
         table.add_row(
             escape(row.name),

@@ -1,4 +1,4 @@
-"""What a method is made of, for people: its terms, and under which names they are recorded."""
+"""The terms of a method, and the names under which they are recorded."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from pgdm.methods import recipe
 
 RECORDED_AS = """\
 recorded under train/, eval_sampled/ and eval_deterministic/: a reward summed over the episode as
-raw/NAME and, weighted, term/NAME; an end as end/NAME; a measure, mean over the episode, as NAME.
-A weight with a schedule: train/weight/NAME."""
-"""Under which names."""
+raw/NAME and, weighted, term/NAME; a termination as end/NAME; a measure, mean over the episode, as
+NAME. A weight with a schedule: train/weight/NAME."""
 
 
 def term_table(cfg: ExperimentCfg) -> Table:
-    """Return the table of the terms that are active in an experiment."""
+    """Return the table of an experiment's active terms."""
     table = Table(box=None)
     for head in ("kind", "name", "weight"):
         table.add_column(head, no_wrap=True)
@@ -26,18 +25,18 @@ def term_table(cfg: ExperimentCfg) -> Table:
 
 
 def setting_line(cfg: ExperimentCfg) -> str:
-    """Return what a run is of, on one line."""
+    """Return task, method, start and learner of a run on one line."""
     start = cfg.pregrasp.source
     if cfg.ablation.changes_start:
         start += f", ablation {cfg.ablation.name}"
     learner = f"{cfg.algo.name}, {cfg.action.kind} actions, seed {cfg.seed}"
-    made = f"method {cfg.method.name}, hand {cfg.hand.name}, pregrasp {start}"
-    return f"{cfg.task.id}: {made}, {learner}"
+    parts = f"method {cfg.method.name}, hand {cfg.hand.name}, pregrasp {start}"
+    return f"{cfg.task.id}: {parts}, {learner}"
 
 
 def term_line(cfg: ExperimentCfg) -> str:
-    """Return the same in a sentence, measures left out."""
+    """Return rewards and terminations of a run on one line."""
     rows = recipe(cfg.method).table()
     rewards = ", ".join(f"{name} {weight}" for kind, name, weight in rows if kind == "reward")
-    ends = ", ".join(name for kind, name, _ in rows if kind == "end")
-    return f"rewards {rewards}; ends {ends}"
+    ends = ", ".join(name for kind, name, _ in rows if kind == "termination")
+    return f"rewards {rewards}; terminations {ends}"

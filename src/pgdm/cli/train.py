@@ -1,32 +1,28 @@
-"""One run, as a person watches it."""
+"""One run, as the user watches it."""
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
-from rich.console import Console
-
-from pgdm.cli.errors import report
-from pgdm.cli.progress import ProgressView
-from pgdm.cli.summary import summary_table
+from pgdm.cli.console.errors import report
+from pgdm.cli.console.progress import ProgressView
+from pgdm.cli.console.screen import SCREEN, console, notify
+from pgdm.cli.console.summary import summary_table
 from pgdm.cli.terms import RECORDED_AS, setting_line, term_line, term_table
-from pgdm.config.schema import ExperimentCfg
+from pgdm.config.saved import load_config
+from pgdm.config.schema import ExperimentCfg, check_device
 from pgdm.experiment import RunResult, run_experiment
+from pgdm.runs.folder import folder_of
 from pgdm.stop import StopRequest
-
-_PROGRESS = Console(stderr=True)
-
-
-def notify(text: str) -> None:
-    """Tell what takes time, or differs from what was asked."""
-    _PROGRESS.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def show(cfg: ExperimentCfg, notes: Sequence[str]) -> None:
-    """Print what a run would be made of and what is to be said of it, and start nothing."""
+    """Print the settings and terms of a run, with notes, and start nothing."""
     print(setting_line(cfg))
-    Console().print(term_table(cfg))
+    console().print(term_table(cfg))
     print(RECORDED_AS)
     for note in notes:
         print(f"note:   {note}")
@@ -34,18 +30,18 @@ def show(cfg: ExperimentCfg, notes: Sequence[str]) -> None:
 
 
 def train(cfg: ExperimentCfg, patient: bool = False) -> int:
-    """Do a run, or go on with it, and return the exit code.
+    """Start or resume a run, and return the exit code.
 
     Progress goes to stderr, the result to stdout.
 
     Args:
         cfg: the run.
-        patient: whether a second signal leaves it to save in peace.
+        patient: whether further signals after the first are ignored.
 
     Raises:
         PgdmError: if the run fails.
     """
-    view = ProgressView(cfg.task.id, _PROGRESS)
+    view = ProgressView(cfg.task.id, SCREEN)
     notify(setting_line(cfg))
     notify(term_line(cfg))
     with StopRequest(patient) as stop:
@@ -57,7 +53,7 @@ def train(cfg: ExperimentCfg, patient: bool = False) -> int:
     if result.status == "interrupted":
         print(
             f"stopped and saved at {result.frames:,} of {cfg.total_frames:,} frames in "
-            f"{result.run_dir}; the same command goes on",
+            f"{result.run_dir}; the same command resumes the run, as pgdm resume does",
             file=sys.stderr,
         )
         return stop.exit_code
@@ -65,14 +61,54 @@ def train(cfg: ExperimentCfg, patient: bool = False) -> int:
     return 0
 
 
+def resume_run(
+    run: Path,
+    total_frames: int | None,
+    time_limit_min: float | None,
+    uri: str | None,
+    offline: bool,
+) -> int:
+    """Resume a run with the settings in its folder, and return the exit code.
+
+    Args:
+        run: its folder, or a file in it.
+        total_frames: new length; None: as before.
+        time_limit_min: new limit; None: as before, 0: none.
+        uri: MLflow store to mirror the run to; None: that of ``MLFLOW_TRACKING_URI`` or the one
+            beside the run. What the folder names is not written to: somebody else may have made it.
+        offline: whether missing assets are an error instead of being fetched.
+
+    Raises:
+        PgdmError: if the folder holds no run, or the run fails.
+    """
+    from pgdm.tracking.mlflow import is_own
+
+    cfg = load_config(folder_of(run))
+    named = cfg.tracking.uri
+    if named and not uri and not is_own(named, Path(cfg.run_dir)):
+        notify(f"the run's folder names the MLflow store {named}; --uri {named} mirrors it there")
+    limit = cfg.time_limit_min if time_limit_min is None else time_limit_min or None
+    cfg = dataclasses.replace(
+        cfg,
+        total_frames=cfg.total_frames if total_frames is None else total_frames,
+        time_limit_min=limit,
+        resume="must",
+        offline=offline or cfg.offline,
+        tracking=dataclasses.replace(cfg.tracking, uri=uri),
+    )
+    cfg.validate()
+    check_device(cfg.device)
+    return train(cfg)
+
+
 def _show(cfg: ExperimentCfg, result: RunResult) -> None:
     if result.frames < cfg.total_frames:
         notify(
             f"time_limit_min={cfg.time_limit_min:g} was reached at {result.frames:,} of "
-            f"{cfg.total_frames:,} frames; this is what was learned by then"
+            f"{cfg.total_frames:,} frames; the result is that of the training so far"
         )
-    console = Console()
-    console.print(summary_table(cfg, result))
+    screen = console()
+    screen.print(summary_table(cfg, result))
     # Not through rich: a path must stay whole on its line.
     print(f"run:    {result.run_dir}")
     if result.video is not None:

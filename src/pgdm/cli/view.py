@@ -1,125 +1,130 @@
-"""``pgdm view``: a task's exemplar motion, the reach before it, and the expert's hand."""
+"""``pgdm view``: a task's exemplar motion, its reach, its wrist plan, or the expert's hand."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
-from pgdm.cli.pregrasp_scenes import composed
-from pgdm.cli.train import notify
-from pgdm.envs.film import film_expert, film_motion, film_reach, film_wrist
-from pgdm.errors import ConfigError
-from pgdm.experiment import assets, env_builder
-from pgdm.library import ensure_expert
-from pgdm.pregrasp.rollout import play
+import numpy as np
+
+from pgdm.cli.console.screen import bars
+from pgdm.cli.scenes import composed, open_env
+from pgdm.envs.build import EnvBuilder
+from pgdm.envs.film import Clip, film_clip
+from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.library.tasks import MOCAP_TASKS
+from pgdm.pregrasp.reach.rollout import play
 from pgdm.pregrasp.sources import no_plan
-from pgdm.sim.replay import expert_marks, expert_qpos, motion_qpos
+from pgdm.sim.motion_states import expert_marks, expert_qpos, motion_qpos
 
 
-def view_task(
-    task: str, hand: str | None, video: Path | None, pregrasp: str, offline: bool
-) -> None:
-    """Replay the motion in a window, or into an MP4.
+@dataclass(frozen=True)
+class View:
+    """Which task to view, and where; a window is opened or an MP4 written."""
+
+    task: str
+    hand: str | None
+    """None: the task's own."""
+    video: Path | None
+    """MP4 to write; None: open a window."""
+    pregrasp: str
+    """Source of the start."""
+    offline: bool
+
+    def open(self, *overrides: str) -> EnvBuilder:
+        """Compile the task's environment."""
+        return open_env(composed(self.task, self.hand, *overrides, offline=self.offline))
+
+    def open_at_start(self, *overrides: str) -> EnvBuilder:
+        """Compile it with the hand at the chosen start."""
+        return self.open(f"pregrasp={self.pregrasp}", *overrides)
+
+    def show(self, builder: EnvBuilder, clip: Clip) -> None:
+        """Show a clip in a window, or write it to the MP4."""
+        if self.video is None:
+            from pgdm.sim.viewer import show_motion
+
+            show_motion(clip.scene.model, clip.qpos, clip.marks)
+            return
+        fps = round(1 / (builder.motion.substeps * clip.scene.model.opt.timestep))
+        with bars() as progress:
+            poster = film_clip(clip, fps, self.video, progress)
+        print(f"video:  {self.video}")
+        print(f"poster: {poster}")
+
+
+def view_task(view: View) -> None:
+    """Replay the exemplar motion with the hand at its pre-grasp; nothing is simulated.
+
+    If the tracked body has six joints of its own the object itself moves, else only its ghost.
 
     Raises:
         PgdmError: if the task is unknown, its assets are missing, or nothing can be drawn.
     """
-    _check(video)
-    cfg = composed(task, hand, f"pregrasp={pregrasp}", f"offline={str(offline).lower()}")
-    builder = env_builder(cfg, assets(cfg, notify))
-    start, reference = builder.mdp.start, builder.mdp.reference
-    for note in builder.notes:
-        notify(note)
-    if video is None:
-        from pgdm.sim.viewer import show_motion
-
-        show_motion(builder.scene.model, motion_qpos(builder.scene, start.qpos, reference))
-        return
-    _say(video, film_motion(builder.make(1, 1), video))
+    builder = view.open_at_start()
+    scene, reference = builder.scene, builder.mdp.reference
+    qpos = motion_qpos(scene, builder.mdp.start.qpos, reference)
+    captions = _numbered(scene.task.id, "exemplar motion", len(qpos))
+    view.show(builder, Clip(scene, reference, qpos, captions, ghost=True))
 
 
-def view_reach(
-    task: str, hand: str | None, video: Path | None, pregrasp: str, offline: bool
-) -> None:
-    """Play the plan that leads to a start, in a window, or into an MP4.
+def view_reach(view: View) -> None:
+    """Play the reach to a start.
 
     Raises:
         PgdmError: if the task is unknown, its assets are missing, no plan leads to the start, or
             nothing can be drawn.
     """
-    _check(video)
-    start = f"pregrasp={pregrasp}", "pregrasp.fallback=null"
-    cfg = composed(task, hand, *start, f"offline={str(offline).lower()}")
-    builder = env_builder(cfg, assets(cfg, notify))
-    scene, source, reach = builder.scene, builder.mdp.start.source, builder.mdp.start.reach
-    if reach is None:
-        raise ConfigError(no_plan(source, scene))
-    qpos = play(scene, reach.actions, reach.qpos, builder.motion.substeps).qpos
-    if video is None:
-        from pgdm.sim.viewer import show_motion
-
-        show_motion(scene.model, qpos)
-        return
-    _say(video, film_reach(builder.make(1, 1), qpos, video))
+    builder = view.open_at_start("pregrasp.fallback=null")
+    scene, start = builder.scene, builder.mdp.start
+    if start.reach is None:
+        raise ConfigError(no_plan(start.source, scene))
+    qpos = play(scene, start.reach.actions, start.reach.qpos, builder.motion.substeps).qpos
+    captions = _numbered(scene.task.id, "reach", len(qpos))
+    view.show(builder, Clip(scene, builder.mdp.reference, qpos, captions, hold=True))
 
 
-def view_wrist(
-    task: str, hand: str | None, video: Path | None, pregrasp: str, offline: bool
-) -> None:
-    """Play what the hand alone does with the planned commands of its wrist; print how near it is.
+def view_wrist(view: View) -> None:
+    """Play how the planned wrist commands move the hand alone, and print how closely it follows.
 
     Raises:
         PgdmError: if the task is unknown, its assets are missing, the hand's base cannot follow a
             plan, or nothing can be drawn.
     """
-    _check(video)
-    planned = "+experiment=fast", f"pregrasp={pregrasp}", f"offline={str(offline).lower()}"
-    cfg = composed(task, hand, *planned)
-    builder = env_builder(cfg, assets(cfg, notify), notify)
-    plan = builder.wrist
-    assert plan is not None  # the experiment wants one
+    builder = view.open_at_start("+experiment=fast")
+    plan, task = builder.wrist, builder.scene.task.id
+    assert plan is not None  # the experiment asks for one
     print(plan.described())
-    if video is None:
-        from pgdm.sim.viewer import show_motion
+    captions = [
+        f"{task}  hand alone  step {t}  error {100 * error:.1f} cm"
+        for t, error in enumerate(np.append(0.0, plan.error_m))
+    ]
+    clip = Clip(builder.scene, builder.mdp.reference, plan.qpos, captions, ghost=True)
+    view.show(builder, clip)
 
-        show_motion(builder.scene.model, plan.qpos)
-        return
-    _say(video, film_wrist(builder.make(1, 1), plan, video))
 
-
-def view_expert(task: str, video: Path | None, offline: bool) -> None:
-    """Play hand and object together as a person moved them, in a window, or into an MP4.
+def view_expert(view: View) -> None:
+    """Play hand and object together as a person moved them.
 
     Raises:
         PgdmError: if the task is unknown or has no expert hand trajectory, its assets are
             missing, or nothing can be drawn.
     """
-    _check(video)
-    library = ensure_expert(composed(task, None).task.motion, offline, notify)
-    # The recorded pose is that of the mesh's origin: only so the fingers lie where they lay.
-    cfg = composed(task, None, "method=graff", "pregrasp=mined", "reference=com_corrected")
-    builder = env_builder(cfg, library)
+    motion = composed(view.task, view.hand, offline=True).task.motion
+    if motion not in MOCAP_TASKS:
+        hint = "Only motion-capture tasks have one."
+        raise UnknownNameError("expert hand trajectory", motion, MOCAP_TASKS, hint)
+    # The recorded pose is that of the mesh's origin: only so do the fingers touch where they did.
+    builder = view.open("method=graff", "pregrasp=mined", "reference=com_corrected")
     scene, mdp, expert = builder.scene, builder.mdp, builder.expert
     assert expert is not None and mdp.expert is not None  # the method needs one
-    for note in builder.notes:
-        notify(note)
-    reference = mdp.reference
     # As published, not clipped to the limits: what the person did, not what the robot can do.
-    qpos = expert_qpos(scene, mdp.start.qpos, reference, expert.qpos)
-    marks = expert_marks(reference, mdp.expert)
-    if video is None:
-        from pgdm.sim.viewer import show_motion
-
-        show_motion(scene.model, qpos, marks)
-        return
+    qpos = expert_qpos(scene, mdp.start.qpos, mdp.reference, expert.qpos)
     title = "expert hand, rebuilt: approximate" if expert.approximate else "expert hand"
-    _say(video, film_expert(scene, qpos, marks, reference, title, video))
+    captions = _numbered(scene.task.id, title, len(qpos))
+    marks = expert_marks(mdp.reference, mdp.expert)
+    view.show(builder, Clip(scene, mdp.reference, qpos, captions, marks=marks))
 
 
-def _check(video: Path | None) -> None:
-    if video is not None and video.suffix.lower() != ".mp4":
-        raise ConfigError(f"--video '{video}' is no MP4; give a name that ends in .mp4")
-
-
-def _say(video: Path, poster: Path) -> None:
-    print(f"video:  {video}")
-    print(f"poster: {poster}")
+def _numbered(task: str, title: str, count: int) -> list[str]:
+    return [f"{task}  {title}  {t}/{count - 1}" for t in range(count)]

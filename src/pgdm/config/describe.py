@@ -1,4 +1,4 @@
-"""What the files in ``conf/`` say about themselves: keys, values, and the comment on each."""
+"""What the files in ``conf/`` document: their keys, values, and the comment on each."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
+
+from pgdm import files
 
 _PACKAGE_LINE = "# @package"
 
@@ -30,7 +32,7 @@ class Description:
     title: str
     """The comment at its top."""
     defaults: dict[str, str]
-    """Its defaults list: group to option; files that it builds on have an empty option."""
+    """Its defaults list: group to option; the option of a plain file is empty."""
     keys: list[Key]
     """Its keys, in order."""
 
@@ -39,16 +41,17 @@ def describe(file: Path) -> Description:
     """Read a file of settings.
 
     Raises:
-        yaml.YAMLError: if it is not valid YAML.
+        ValueError: if it is not valid YAML.
         OSError: if it cannot be read.
     """
-    text = file.read_text(encoding="utf-8")
+    text = files.read_text(file)
+    plain = files.parse_yaml(text)  # before the comments are looked for: it sets limits
     lines = text.splitlines()
     root = yaml.compose(text, Loader=yaml.SafeLoader)
     first = 1 if lines and lines[0].startswith(_PACKAGE_LINE) else 0
     keys = [] if root is None else list(_keys(root, lines, ""))
     title = _comment(lines[first:], _end_of_comment(lines[first:]))
-    return Description(title, _defaults(yaml.safe_load(text) or {}), keys)
+    return Description(title, _defaults(plain if isinstance(plain, dict) else {}), keys)
 
 
 def _keys(node: yaml.Node, lines: list[str], path: str) -> Iterator[Key]:

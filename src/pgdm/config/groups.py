@@ -1,4 +1,4 @@
-"""Which settings there are to choose from, read from ``conf/`` without loading anything heavy."""
+"""The available settings, read from ``conf/`` without slow imports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,20 @@ from pgdm.errors import ConfigError, UnknownNameError
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
-# Folders of conf/ that Hydra reads for itself, or that are no choice of a run.
+GROUPS = {
+    "method": "method.name",
+    "ablation": "ablation.name",
+    "pregrasp": "pregrasp.source",
+    "action": "action.kind",
+    "algo": "algo.name",
+    "shaping": "shaping.name",
+    "obs": "obs.layout",
+    "reference": "reference.frame",
+    "hand": "hand.name",
+}
+"""Config group to the key of a configuration that holds the name of the chosen option."""
+
+# Folders of conf/ that are not settings of a run.
 _NO_GROUPS = ("hydra", "suite", "sweeps")
 
 
@@ -23,19 +36,19 @@ def conf_dir() -> Path:
         if (folder / "config.yaml").is_file():
             return folder
     raise ConfigError(
-        f"the settings (conf/config.yaml) are missing beside {_PACKAGE}; install pgdm anew"
+        f"the settings (conf/config.yaml) are missing next to {_PACKAGE}; reinstall pgdm"
     )
 
 
 def folders(config_dir: str | Path | None) -> list[Path]:
-    """Return the folders of settings: pgdm's, then the user's own ones."""
+    """Return the folders of settings: pgdm's, then the user's."""
     return [conf_dir(), *own_folders(config_dir)]
 
 
 def own_folders(config_dir: str | Path | None) -> list[Path]:
-    """Return the user's folders of settings: the one named for this command, then the lasting one.
+    """Return the user's folders of settings in Hydra's order of search.
 
-    Hydra looks into them in this order.
+    First the one named in this command, then the permanent one.
     """
     lasting = [paths.user_conf()] if paths.user_conf().is_dir() else []
     return lasting if config_dir is None else [Path(config_dir), *lasting]
@@ -44,13 +57,13 @@ def own_folders(config_dir: str | Path | None) -> list[Path]:
 def check_own(config_dir: str | Path | None) -> None:
     """Refuse the user's files that have the group and name of one of pgdm's.
 
-    Hydra finds pgdm's first, and would take it without a word.
+    Hydra finds pgdm's first, and would use it silently.
 
     Raises:
         ConfigError: at the first one; names both files.
     """
     ours = conf_dir()
-    # The sweep files lie beside conf/.
+    # The sweep files are in a folder next to conf/.
     files = {file.relative_to(ours): file for file in ours.glob("*/**/*.yaml")}
     sweeps = ours.parent / "sweeps"
     files |= {file.relative_to(ours.parent): file for file in sweeps.glob("*.yaml")}
@@ -59,7 +72,7 @@ def check_own(config_dir: str | Path | None) -> None:
             own = folder / name
             if own.is_file() and not own.samefile(file):
                 raise ConfigError(
-                    f"{own} has the name of pgdm's {file}, which would be used in its place; "
+                    f"{own} has the name of pgdm's {file}, which would be used instead; "
                     "give yours another name"
                 )
 
@@ -81,7 +94,7 @@ def available(group: str, config_dir: str | Path | None = None) -> list[str]:
 
     Args:
         group: name of the group.
-        config_dir: a folder of the user's own settings to look into besides.
+        config_dir: a folder of the user's own settings to search as well.
 
     Raises:
         UnknownNameError: if there is no such group.
@@ -89,10 +102,26 @@ def available(group: str, config_dir: str | Path | None = None) -> list[str]:
     known = groups(config_dir)
     if group not in known:
         raise UnknownNameError("config group", group, known)
-    names = {
-        path.stem
-        for folder in folders(config_dir)
-        for path in (folder / group).glob("*.yaml")
-        if not path.name.startswith("_")
-    }
-    return sorted(names)
+    return sorted({path.stem for path in _files(group, config_dir) if unusable(path) is None})
+
+
+def unreadable(group: str, config_dir: str | Path | None = None) -> dict[Path, str]:
+    """Return the files of a config group that are no options, each with the reason."""
+    reasons = {path: unusable(path) for path in _files(group, config_dir)}
+    return {path: reason for path, reason in reasons.items() if reason is not None}
+
+
+def unusable(path: Path) -> str | None:
+    """Return why a file cannot be an option, or None."""
+    if not path.is_file():
+        return "a link that leads nowhere" if path.is_symlink() else "not a file"
+    try:
+        paths.check_path_part("its name", path.stem)
+    except ConfigError as error:
+        return str(error)
+    return None
+
+
+def _files(group: str, config_dir: str | Path | None) -> list[Path]:
+    found = [path for one in folders(config_dir) for path in sorted((one / group).glob("*.yaml"))]
+    return [path for path in found if not path.name.startswith("_")]

@@ -1,15 +1,15 @@
-"""Which hand a task's motion was made with."""
+"""The hand for which a task's motion was recorded."""
 
 from __future__ import annotations
 
+from pgdm.config.compose import compose
 from pgdm.config.schema import ExperimentCfg
-from pgdm.config.store import compose
 from pgdm.library import Library
 from pgdm.sim.scene import HandCfg
 
 
 def own_hand(cfg: ExperimentCfg, library: Library) -> HandCfg:
-    """Return the hand whose joints the motion's stored starts are, whatever hand takes it up.
+    """Return the hand of the motion's stored start states, whichever hand the experiment uses.
 
     Raises:
         UnknownNameError: the library lacks the motion, or there are no settings of the hand.

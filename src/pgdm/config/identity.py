@@ -1,21 +1,22 @@
-"""What makes two experiments the same one, and whether a run may go on under new settings."""
+"""What makes two experiments the same, and whether a run may resume with new settings."""
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pgdm.config.strict import flatten
 from pgdm.errors import RunError
+from pgdm.paths import inside
+from pgdm.runs.config_file import dotted
 
 if TYPE_CHECKING:  # it loads the simulator and torch
     from pgdm.config.schema import ExperimentCfg
 
-# Keys that change where, when and how a run is done or shown, not what it computes.
+# Keys that change where, when and how a run is done or displayed, but not what it computes.
 _BESIDE = (
     "run_dir",
     "resume",
@@ -31,7 +32,7 @@ _BESIDE = (
     "eval.interval_frames",
     "eval.video",
     "eval.video_every_eval",
-    # What is known of the task, and does not act on it.
+    # Facts about the task without an effect on it.
     "task.pregrasp_source",
     "task.trajectory_source",
     "task.tcdm30",
@@ -39,8 +40,7 @@ _BESIDE = (
     "task.paper_com_error",
 )
 
-
-# Keys that came after the first runs, and the values that those runs amount to.
+# Keys that were added after the first runs, with the values that those runs correspond to.
 ADDED_LATER: dict[str, Any] = {
     "action.wrist_path": "carried",
     "action.hold_steps": 0,
@@ -51,16 +51,17 @@ ADDED_LATER: dict[str, Any] = {
     "shaping.kernel_weight": 0.0,
     "shaping.kernel_scale": 10.0,
     "shaping.soft_end_m": None,
+    "sim.engine": "mujoco",
     "sim.object_mass": "volume",
     "time_limit_min": None,
 }
 
-
-_ONLY_PLANNED = ("action.hold_steps", "action.carry_load")  # they act where the wrist is planned
+# They have an effect only if the wrist is planned.
+_ONLY_PLANNED = ("action.hold_steps", "action.carry_load")
 
 
 def with_added_keys(plain: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a stored configuration with the keys that it is too old to have."""
+    """Return a stored configuration, completed with keys that were added since."""
     result = dict(plain)
     for key, value in ADDED_LATER.items():
         group, _, name = key.rpartition(".")
@@ -74,39 +75,41 @@ def with_added_keys(plain: Mapping[str, Any]) -> dict[str, Any]:
 def identity(cfg: ExperimentCfg) -> dict[str, Any]:
     """Return the keys (dotted) and values that change the result of an experiment.
 
-    A key of ``ADDED_LATER`` is left out at its value there, so that an experiment keeps the hash,
-    folder and sweep job that it had before there was the key.
+    A key of ``ADDED_LATER`` is left out if it has the value there, so that an experiment keeps the
+    hash, folder and sweep job that it had before the key existed.
     """
-    flat = flatten(dataclasses.asdict(cfg))
     idle = () if cfg.action.plans_wrist else _ONLY_PLANNED
     return {
         k: v
-        for k, v in flat.items()
+        for k, v in dotted(cfg).items()
         if changes_result(k) and k not in idle and not (k in ADDED_LATER and v == ADDED_LATER[k])
     }
 
 
+@cache
 def changes_result(key: str) -> bool:
-    """Return whether a setting, by its dotted key, acts on what an experiment computes."""
+    """Return whether a setting, by its dotted key, affects what an experiment computes."""
     return not any(key == part or key.startswith(f"{part}.") for part in _BESIDE)
 
 
 def identity_hash(cfg: ExperimentCfg) -> str:
-    """Return 8 hex digits that two experiments share if their identities are equal."""
+    """Return 8 hex digits, equal for two experiments with the same identity."""
     text = json.dumps(identity(cfg), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def default_run_dir(cfg: ExperimentCfg) -> str:
-    """Return the run folder, relative to the working directory, that belongs to an experiment."""
+    """Return the default run folder of an experiment, relative to the working directory."""
     start = f"{cfg.pregrasp.source}-{cfg.action.kind}-{cfg.algo.name}"
     name = f"{start}-s{cfg.seed}-{identity_hash(cfg)}"
-    method = cfg.method.name.replace(":", ".")  # a user's own: no system forbids the dot
-    return str(Path("runs") / cfg.task.id / method / name)
+    method = cfg.method.name.replace(
+        ":", "."
+    )  # of a user's own method; every system allows the dot
+    return str(inside(Path("runs"), cfg.task.id, method, name))
 
 
 def difference(old: ExperimentCfg, new: ExperimentCfg) -> list[str]:
-    """Return what changed of the identity, one ``key: old -> new`` an entry."""
+    """Return the changes of the identity, each as ``key: old -> new``."""
     before, after = ADDED_LATER | identity(old), ADDED_LATER | identity(new)
     return [
         f"{key}: {before.get(key)} -> {after.get(key)}"
@@ -116,7 +119,7 @@ def difference(old: ExperimentCfg, new: ExperimentCfg) -> list[str]:
 
 
 def check_continues(old: ExperimentCfg, new: ExperimentCfg) -> None:
-    """Check that ``new`` may go on in the run folder that ``old`` was saved in.
+    """Check that ``new`` may resume in the run folder that ``old`` was saved in.
 
     Raises:
         RunError: if it is another experiment, or a shorter one; the message is the difference.
@@ -127,5 +130,5 @@ def check_continues(old: ExperimentCfg, new: ExperimentCfg) -> None:
     if changes:
         raise RunError(
             f"run folder '{new.run_dir}' holds another experiment ({'; '.join(changes)}); "
-            "choose another run_dir, or the settings it was made with"
+            "choose another run_dir, or the settings of that run"
         )

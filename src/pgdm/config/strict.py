@@ -1,4 +1,4 @@
-"""Plain data -> frozen dataclasses, and nothing is guessed: names and types must be right."""
+"""From plain data to frozen dataclasses; names and types must match exactly."""
 
 from __future__ import annotations
 
@@ -11,11 +11,15 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
 
+from pgdm.config.synonyms import meant
 from pgdm.errors import ConfigError, UnknownNameError
 
 T = TypeVar("T")
 
 _KIND = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
+
+_LARGEST = {int: 2**63 - 1, float: 1e15}
+"""Of absolute values: 64 bits, and what has a finite square in 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +31,13 @@ class ChosenBy:
     find: Callable[[str], type]
     """From its value to the class, a subclass of the one written down; raises ConfigError."""
     names: tuple[str, ...]
-    """Values there are, for the messages; ``find`` may take others too."""
+    """Known values, for the messages; ``find`` may accept others too."""
 
     def of(self, data: Mapping[str, object], path: str) -> type:
         """Return the class for some data.
 
         Raises:
-            ConfigError: if they do not say it, or have keys of another class.
+            ConfigError: if the key is missing, or the data have keys of another class.
         """
         where = _join(path, self.key)
         if self.key not in data:
@@ -63,7 +67,7 @@ def build(cls: type[T], data: object, path: str = "") -> T:
             these or None.
         data: a mapping with exactly its fields. A whole number is a valid float, and a float
             without a fraction (1e6) a valid int; nothing else is converted.
-        path: where the data stands in the whole, for the messages.
+        path: dotted key of the data in the whole, for the messages.
 
     Raises:
         ConfigError: if a key is missing or unknown, or a value has the wrong type.
@@ -76,7 +80,7 @@ def build(cls: type[T], data: object, path: str = "") -> T:
         if key not in names:
             # Only the last part differs, so that the nearest names are compared without the rest.
             where = f"key of '{path}'" if path else "key"
-            raise UnknownNameError(where, str(key), names)
+            raise UnknownNameError(where, str(key), names, meant=meant(str(key), names))
     missing = [_join(path, name) for name in names if name not in data]
     if missing:
         raise ConfigError(f"missing {', '.join(missing)}; give a value, such as {missing[0]}=...")
@@ -100,11 +104,18 @@ def _value(hint: Any, value: object, path: str) -> Any:
         return [_value(item, entry, f"{path}[{i}]") for i, entry in enumerate(value)]
     if dataclasses.is_dataclass(hint):
         return build(typing.cast(type, hint), value, path)
-    return _scalar(hint, value, path)
+    return scalar(hint, value, path)
 
 
-def _scalar(kind: type, value: object, path: str) -> bool | int | float | str:
+def scalar(kind: type, value: object, path: str) -> bool | int | float | str:
+    """Return a bool, int, float or str as the kind that a key has.
+
+    Raises:
+        ConfigError: if it is of another kind.
+    """
     if kind in (int, float) and isinstance(value, int | float) and not isinstance(value, bool):
+        if math.isfinite(value) and abs(value) > _LARGEST[kind]:
+            raise ConfigError(f"{path}: {_show(value)} is too large; at most {_LARGEST[kind]:.4g}")
         if kind is float and not math.isfinite(value):
             raise ConfigError(f"{path}: {value} is not a finite number")
         if kind is float:
@@ -130,12 +141,3 @@ def _show(value: object) -> str:
 
 def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
-
-
-def flatten(data: Mapping[str, Any], path: str = "") -> dict[str, Any]:
-    """Return nested data as one dict with dotted keys; lists stay whole."""
-    flat: dict[str, Any] = {}
-    for key, value in data.items():
-        name = _join(path, str(key))
-        flat.update(flatten(value, name) if isinstance(value, Mapping) else {name: value})
-    return flat

@@ -1,26 +1,24 @@
-"""Suites: named lists of tasks, written down or derived from what the tasks' files say."""
+"""Suites: named lists of tasks, either explicit or selected by keys in the tasks' files."""
 
 from __future__ import annotations
 
 import fnmatch
+import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from pgdm import files
 from pgdm.config.groups import available, folders
 from pgdm.errors import ConfigError, UnknownNameError
 
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_log = logging.getLogger(__name__)
+
 _WILD = "*?["
 
 
 def suites(config_dir: str | Path | None = None) -> dict[str, Path]:
-    """Return the names of the suites, each with its file.
-
-    As with the options of groups, a name of pgdm's stays pgdm's.
-    """
+    """Return the suites' files by name; for a name that pgdm and the user have, pgdm's file."""
     own_last = [f for folder in folders(config_dir) for f in (folder / "suite").glob("*.yaml")]
     found = {file.stem: file for file in reversed(own_last)}
     return dict(sorted(found.items()))
@@ -43,8 +41,8 @@ def expand_tasks(words: Iterable[str], config_dir: str | Path | None = None) -> 
 
     Args:
         words: each a task, a suite, a pattern such as ``dhand-*``, or one of these after a minus,
-            which takes its tasks away from those named before.
-        config_dir: a folder of the user's own settings to look into besides.
+            which removes its tasks from those named before.
+        config_dir: a folder of the user's own settings to search as well.
 
     Raises:
         UnknownNameError: if a word is none of these.
@@ -53,8 +51,32 @@ def expand_tasks(words: Iterable[str], config_dir: str | Path | None = None) -> 
     return tuple(_Expansion(config_dir).tasks(words, ()))
 
 
+def check_task(name: str) -> None:
+    """Check the name of one task.
+
+    Raises:
+        ConfigError: if there is no such task; a suite or pattern is explained.
+    """
+    if name not in available("task"):
+        raise unknown_task(name, None)
+
+
+def unknown_task(name: str, config_dir: str | Path | None) -> ConfigError:
+    """Return the error of a name that should be one task and is none."""
+    if name in suites(config_dir):
+        size = len(suite(name, config_dir))
+        return ConfigError(
+            f"{name} is a suite of {size} tasks; to run them all: pgdm-run -m task={name}"
+        )
+    if "*" in name:
+        return ConfigError(
+            f"'{name}' is a pattern for several tasks; to run them all: pgdm-run -m 'task={name}'"
+        )
+    return UnknownNameError("task", name, [*available("task", config_dir), *suites(config_dir)])
+
+
 class _Expansion:
-    """What there is to choose from, read once."""
+    """The available tasks and suites, read once."""
 
     def __init__(self, config_dir: str | Path | None) -> None:
         self.folders = folders(config_dir)
@@ -94,8 +116,12 @@ class _Expansion:
         raise ConfigError(f"{file}: a suite has either tasks: [...] or where: {{key: value}}")
 
     def _fits(self, task: str, where: dict[str, Any]) -> bool:
-        files = [folder / "task" / f"{task}.yaml" for folder in self.folders]
-        facts = task_facts(next(file for file in files if file.exists()))
+        places = [folder / "task" / f"{task}.yaml" for folder in self.folders]
+        try:
+            facts = task_facts(next(file for file in places if file.is_file()))
+        except ConfigError as error:  # one file of the user's does not block the others
+            _log.warning("task '%s' is left out of suites: %s", task, error)
+            return False
         return all(
             facts.get(key) is not None if value == "any" else facts.get(key) == value
             for key, value in where.items()
@@ -103,7 +129,7 @@ class _Expansion:
 
 
 def task_facts(file: Path) -> dict[str, Any]:
-    """Return what the file of a task itself says, with the hand that plays it as ``hand``."""
+    """Return the keys in the file of a task itself, with its own hand as ``hand``."""
     content = _read(file)
     for entry in content.pop("defaults", None) or []:
         for key, option in entry.items() if isinstance(entry, dict) else ():
@@ -114,9 +140,9 @@ def task_facts(file: Path) -> dict[str, Any]:
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        content = yaml.load(file.read_text(encoding="utf-8"), Loader=_LOADER) or {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from error
+        content = files.read_yaml(file) or {}
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{file}: {files.reason(error)}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{file} holds no keys")
     return content

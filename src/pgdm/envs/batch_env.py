@@ -1,4 +1,4 @@
-"""The MDP over a batch of simulations: what the learner steps."""
+"""The MDP over a batch of simulations, which learners step."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ import torch
 from torch import Tensor
 
 from pgdm.envs.divergence import History
-from pgdm.envs.finished import Finished
-from pgdm.errors import ConfigError, RunError, UnknownNameError
+from pgdm.envs.episodes import RunningEpisodes
+from pgdm.errors import ConfigError, RunError, check_name
 from pgdm.mdp.actions import ActionMap
 from pgdm.mdp.context import StepContext
-from pgdm.mdp.metrics import Episodes
 from pgdm.mdp.observations import Observe
 from pgdm.mdp.recipe import Recipe
 from pgdm.motion.reference import ExpertReference, ObjectReference
-from pgdm.pregrasp.rollout import to_targets
+from pgdm.pregrasp.reach.rollout import to_targets
 from pgdm.pregrasp.sources import StartState, no_plan
-from pgdm.sim.batch import SimBatch, SimState
+from pgdm.sim.batch import Array, SimState, Simulations
 from pgdm.sim.randomize import Randomizer
 
 StepResult = tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]
@@ -43,44 +42,40 @@ class Mdp:
 class BatchEnv:
     """N copies of one task, stepped together.
 
-    All tensors are on the CPU. Frames are the world's; units are m, rad, s.
+    All tensors are on the device of the simulations. Poses are in the world frame; units m, rad, s.
 
     Args:
         sim: the simulations.
-        mdp: observations, actions, rewards, ends, metrics.
+        mdp: observations, actions, rewards, terminations, metrics, on the device of ``sim``.
         randomize: per-reset variation of a simulation's contact, or None.
-        auto_reset: whether finished rows restart by themselves; if not, stepping them further is
-            an error of the caller.
-        dump_dir: folder for the last states and actions of simulations that diverge, or None.
+        auto_reset: whether rows restart automatically when their episode ends; if not, stepping
+            them further is an error of the caller.
+        dump_dir: folder for the last states and targets of simulations that diverge, or None.
     """
 
     def __init__(
         self,
-        sim: SimBatch,
+        sim: Simulations,
         mdp: Mdp,
         randomize: Randomizer | None = None,
         auto_reset: bool = True,
         dump_dir: Path | None = None,
     ) -> None:
         self.sim, self.mdp = sim, mdp
-        self.num_envs = sim.num_envs
+        self.num_envs, self.device = sim.num_envs, sim.device
         self.action_dim = sim.scene.index.num_actuators
         self._randomize, self._auto_reset = randomize, auto_reset
         self._history = History(sim, dump_dir)
         self._names = [term.name for term in mdp.recipe.rewards]
         self._weights = torch.tensor(
-            [[term.weight] for term in mdp.recipe.rewards], dtype=torch.float64
+            [[term.weight] for term in mdp.recipe.rewards],
+            dtype=torch.float64,
+            device=self.device,
         )
-        n, horizon = self.num_envs, len(mdp.reference)
-        self._t = torch.zeros(n, dtype=torch.int64)
-        # Of each reward term, (2, K, N): weighted, then raw, summed over the episode.
-        self._term_sums = torch.zeros(2, len(self._names), n, dtype=torch.float64)
-        # Of each measure, (2, M, N): its sum over the steps in which it applies, and their number.
-        self._measured = torch.zeros(2, len(mdp.recipe.measures), n, dtype=torch.float64)
-        self._pos = torch.zeros(n, horizon, 3, dtype=torch.float64)
-        self._quat = torch.zeros(n, horizon, 4, dtype=torch.float64)
-        self._all = np.arange(n)
-        self._rows = torch.arange(n)
+        n = self.num_envs
+        self._t = torch.zeros(n, dtype=torch.int64, device=self.device)
+        self._episodes = RunningEpisodes(n, mdp.reference, mdp.recipe)
+        self._all = torch.arange(n, device=self.device)
         self._start = self._read_start()
         self._obs = self.reset()
         self.obs_dim = self._obs.shape[1]
@@ -91,12 +86,13 @@ class BatchEnv:
         """Steps since reset, (N,) int64."""
         return self._t
 
-    def reset(self, ids: np.ndarray | None = None) -> Tensor:
+    def reset(self, ids: Array | None = None) -> Tensor:
         """Restart simulations ids (k,), or all; return the observations of all, (N, D) float32."""
-        ids = self._all if ids is None else ids
-        rows = self._restart(ids, self.mdp.start.qpos, self.mdp.start.qvel)
-        obs, self._pos[rows, 0], self._quat[rows, 0] = self._start
-        if len(ids) == self.num_envs:
+        rows = self._all if ids is None else torch.as_tensor(ids, device=self.device)
+        self._restart(rows, self.mdp.start.qpos, self.mdp.start.qvel)
+        obs, pos, quat = self._start
+        self._episodes.place(rows, pos, quat)
+        if len(rows) == self.num_envs:
             self._obs = obs.repeat(self.num_envs, 1)
         else:
             self._obs = self._obs.clone()
@@ -104,11 +100,11 @@ class BatchEnv:
         return self._obs
 
     def reach(self) -> Tensor:
-        """Restart all at the hand's reset pose, carry out the plan; return (N, D) where it ends.
+        """Restart all at the reset pose and carry out the reach; return observations (N, D) then.
 
         Raises:
-            ConfigError: if no plan leads to the start.
-            RunError: if a simulation diverges on the way.
+            ConfigError: if no plan leads to the start state.
+            RunError: if a simulation diverges.
         """
         start, scene = self.mdp.start, self.sim.scene
         if start.reach is None:
@@ -118,7 +114,7 @@ class BatchEnv:
             if self.sim.step(np.tile(ctrl, (self.num_envs, 1))).any():
                 raise RunError(f"the reach of task '{scene.task.id}' diverged")
         state = self.sim.read()
-        self._pos[:, 0], self._quat[:, 0] = state.object_pos, state.object_quat
+        self._episodes.place(self._all, state.object_pos, state.object_quat)
         self._obs = self.mdp.observe(state, self._t)
         return self._obs
 
@@ -126,27 +122,20 @@ class BatchEnv:
         """Take one control step with actions (N, A) in [-1, 1], clipped to it.
 
         Returns:
-            obs (N, D) float32, of restarted rows those after the restart; reward (N,) float32;
+            obs (N, D) float32, for restarted rows that after the restart; reward (N,) float32;
             terminated (N,) bool, the object was lost or the motion ended; truncated (N,) bool,
             the simulation diverged; info with ``final_obs`` (N, D), ``qpos`` (N, nq),
             ``object_error_m`` (N,), ``success`` (N,) bool, ``terms`` {name: (N,)} weighted
-            rewards, ``raw_terms`` before weighting, ``discount`` (N,) that the future counts less
-            in a shaped training or None, ``measures`` {name: (N,)}, NaN where they do
-            not apply, ``ends`` {name: (N,) bool} and ``episodes``, the `Finished` episodes, or
-            None.
+            rewards, ``raw_terms`` unweighted, ``discount`` (N,), the factor on the future that a
+            shaping adds, or None, ``measures`` {name: (N,)}, NaN where they do not apply, ``ends``
+            {name: (N,) bool}, terminations, and ``episodes``, the `FinishedEpisodes`, or None.
+
+        Raises:
+            ConfigError: if the actions are no numbers, or have another shape.
+            RunError: without ``auto_reset``, if the motion is over in a simulation.
         """
-        if not self._auto_reset and bool((self._t >= len(self.mdp.reference) - 1).any()):
-            raise RunError("the motion is over in at least one simulation; reset it before step()")
-        ctrl = self.mdp.actions.act(action, self._t).numpy()
-        self._history.record(ctrl)
-        diverged = torch.from_numpy(self.sim.step(ctrl))
-        state = self.sim.read()
-        # A sum is finite only if all its parts are, and costs a tenth of looking at each.
-        sums = state.qpos.sum(1) + state.object_vel.sum(1)
-        if not math.isfinite(float(sums.sum())):
-            diverged |= ~torch.isfinite(sums)
+        state, diverged = self._advance(self._checked(action))
         some_diverged = bool(diverged.any())
-        self._t = self._t + 1
         context = self._context(state)
         raw = torch.stack([term.value(context) for term in self.mdp.recipe.rewards])  # (K, N)
         measures = {m.name: m.value(context) for m in self.mdp.recipe.measures}
@@ -164,12 +153,12 @@ class BatchEnv:
         terms = self._weights * raw
         reward = terms.sum(0)
         terminated = torch.stack(tuple(ends.values())).any(0)
-        self._remember(terms, raw, measures)
-        self._pos[self._rows, self._t], self._quat[self._rows, self._t] = self._poses(
-            state, diverged if some_diverged else None
-        )
-        done = terminated | diverged
-        finished = done.nonzero()[:, 0]
+        self._episodes.add(terms, raw, measures)
+        self._episodes.follow(self._t, state, diverged if some_diverged else None)
+        finished = (terminated | diverged).nonzero()[:, 0]
+        episodes = None
+        if len(finished):
+            episodes = self._episodes.finished(finished, self._t, diverged, ends)
         info: dict[str, Any] = {
             "final_obs": final,
             "qpos": state.qpos,
@@ -180,12 +169,24 @@ class BatchEnv:
             "discount": None if discount is None else discount.float(),
             "measures": measures,
             "ends": ends,
-            "episodes": self._finished(finished, diverged, ends) if len(finished) else None,
+            "episodes": episodes,
         }
         self._obs = final
         if self._auto_reset and len(finished):
-            self.reset(finished.numpy())
+            self.reset(finished)
         return self._obs, reward.float(), terminated, diverged, info
+
+    def _checked(self, action: Tensor) -> Tensor:
+        try:
+            action = torch.as_tensor(action)  # of NumPy too
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ConfigError(f"the actions are no array of numbers: {error}") from error
+        if action.shape != (self.num_envs, self.action_dim):
+            raise ConfigError(
+                f"the actions have shape {tuple(action.shape)}; it must be (num_envs, action_dim), "
+                f"{(self.num_envs, self.action_dim)}"
+            )
+        return action
 
     def set_weights(self, weights: dict[str, float]) -> None:
         """Change reward weights by term name; schedules do this between iterations.
@@ -194,71 +195,76 @@ class BatchEnv:
             UnknownNameError: if there is no such term.
         """
         for name, weight in weights.items():
-            if name not in self._names:
-                raise UnknownNameError("reward term", name, self._names)
+            check_name("reward term", name, self._names)
             self._weights[self._names.index(name)] = weight
 
     def reward_weights(self) -> dict[str, float]:
-        """Return the weight of each reward term now."""
+        """Return the present weight of each reward term."""
         return dict(zip(self._names, self._weights[:, 0].tolist(), strict=True))
 
     def object_error(self) -> Tensor:
-        """Return the object's current distance from its target, (N,) m."""
+        """Return the present object error, (N,) m."""
         return self._context(self.sim.read()).object_error
 
     def reseed(self, seed: int) -> None:
-        """Restart the stream of the per-reset variation; tasks without one ignore it."""
+        """Restart the random stream of the per-reset variation, if the task has one."""
         if self._randomize is not None:
             self._randomize.reseed(seed)
 
     def warm_start(self) -> Tensor:
-        """Return the action (A,) that a policy's mean should start from (R)."""
+        """Return the action (A,) at which a policy's mean starts (released code)."""
         return self.mdp.actions.warm_start.float()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything the next step depends on."""
+        """Return all that the next step depends on."""
         state: dict[str, Any] = {
-            "rows": torch.from_numpy(self.sim.rows.copy()),
-            "t": self._t.clone(),
-            "obs": self._obs.clone(),
-            "term_sums": self._term_sums.clone(),
-            "pos": self._pos.clone(),
-            "quat": self._quat.clone(),
-            "weights": self._weights.clone(),
+            "rows": torch.as_tensor(self.sim.rows).cpu().clone(),
+            "t": self._t.cpu().clone(),
+            "obs": self._obs.cpu().clone(),
+            "weights": self._weights.cpu().clone(),
+            **self._episodes.state_dict(),
         }
-        if self.mdp.recipe.measures:
-            state["measured"] = self._measured.clone()
         if self._randomize is not None:
             state["randomize"] = self._randomize.state_dict()
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``, to the bit."""
+        """Continue from ``state_dict``, bit-exact."""
         if self._randomize is not None:
             self._randomize.load_state_dict(state["randomize"], self.sim)
         self.sim.restore(state["rows"].numpy())
-        self._t, self._obs = state["t"].clone(), state["obs"].clone()
-        self._term_sums = state["term_sums"].clone()
-        self._pos, self._quat = state["pos"].clone(), state["quat"].clone()
-        self._weights = state["weights"].clone()
-        if self.mdp.recipe.measures:
-            self._measured = state["measured"].clone()
+        self._t = state["t"].to(self.device, copy=True)
+        self._obs = state["obs"].to(self.device, copy=True)
+        self._weights = state["weights"].to(self.device, copy=True)
+        self._episodes.load_state_dict(state)
 
-    def _restart(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> Tensor:
-        """Put simulations ids (k,) into a state with nothing counted yet; return their rows."""
+    def _advance(self, action: Tensor) -> tuple[SimState, Tensor]:
+        """Step all simulations; return their state and which of them diverged, (N,) bool."""
+        if not self._auto_reset and bool((self._t >= len(self.mdp.reference) - 1).any()):
+            raise RunError("the motion is over in at least one simulation; reset it before step()")
+        ctrl = self.mdp.actions.act(action.to(self.device), self._t)
+        self._history.record(ctrl)
+        diverged = torch.as_tensor(self.sim.step(ctrl))
+        state = self.sim.read()
+        # A sum is finite only if all its parts are, and costs a tenth of checking each.
+        sums = state.qpos.sum(1) + state.object_vel.sum(1)
+        if not math.isfinite(float(sums.sum())):
+            diverged |= ~torch.isfinite(sums)
+        self._t = self._t + 1
+        return state, diverged
+
+    def _restart(self, rows: Tensor, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Put simulations rows (k,) into a state and clear their sums."""
         if self._randomize is not None:
-            self._randomize.apply(self.sim, ids)
-        self.sim.reset(ids, qpos, qvel)
-        rows = torch.from_numpy(ids)
+            self._randomize.apply(self.sim, rows)
+        self.sim.reset(rows, qpos, qvel)
         self._t[rows] = 0
-        self._term_sums[:, :, rows] = 0.0
-        self._measured[:, :, rows] = 0.0
-        return rows
+        self._episodes.restart(rows)
 
     def _read_start(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the observation (D,) and the object's position (3,) and quaternion (4,) at reset.
 
-        They are the same after every reset: what a ``Randomizer`` varies shows in contacts only.
+        They are the same after every reset: a ``Randomizer`` only varies contacts.
         """
         one = self._all[:1]
         self.sim.reset(one, self.mdp.start.qpos, self.mdp.start.qvel)
@@ -273,35 +279,7 @@ class BatchEnv:
             last_t=len(reference) - 1,
             target_pos=reference.pos[self._t],
             target_quat=reference.quat[self._t],
-            start_height=self._pos[:, 0, 2],
+            start_height=self._episodes.start_height,
             index=self.sim.scene.index,
             expert=self.mdp.expert,
-        )
-
-    def _remember(self, terms: Tensor, raw: Tensor, measures: dict[str, Tensor]) -> None:
-        """Add a step's terms (K, N), weighted and raw, and its measures to the episodes' sums."""
-        self._term_sums += torch.stack((terms, raw))
-        if measures:
-            values = torch.stack(tuple(measures.values()))
-            self._measured += torch.stack((values.nan_to_num(0.0), (~values.isnan()).double()))
-
-    def _poses(self, state: SimState, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the object's pose, of a diverged simulation its last sane one."""
-        if diverged is None:
-            return state.object_pos, state.object_quat
-        last, keep = self._t - 1, diverged[:, None]
-        return (
-            torch.where(keep, self._pos[self._rows, last], state.object_pos),
-            torch.where(keep, self._quat[self._rows, last], state.object_quat),
-        )
-
-    def _finished(self, rows: Tensor, diverged: Tensor, ends: dict[str, Tensor]) -> Finished:
-        """Return the episodes that finished in ``rows`` (k,)."""
-        return Finished(
-            reference=self.mdp.reference,
-            recipe=self.mdp.recipe,
-            episodes=Episodes(self._pos[rows], self._quat[rows], self._t[rows]),
-            sums=self._term_sums[:, :, rows],
-            measured=self._measured[:, :, rows],
-            flags=torch.stack((diverged, *ends.values()))[:, rows],
         )

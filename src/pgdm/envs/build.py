@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,33 +12,34 @@ import numpy as np
 import torch
 
 from pgdm.envs.batch_env import BatchEnv, Mdp
-from pgdm.errors import UnknownNameError
+from pgdm.errors import check_count, check_name
 from pgdm.library import Expert, Library
 from pgdm.library.published_masses import RATIOS
 from pgdm.mdp.actions import ActionCfg, action_map, warm_targets
 from pgdm.mdp.observations import ObsCfg, layout
 from pgdm.mdp.recipe import Recipe
 from pgdm.mdp.shaping import ShapingCfg, shaped
+from pgdm.memory import check_fits
 from pgdm.motion.reference import FRAMES, ExpertReference, ObjectReference, ReferenceCfg
-from pgdm.pregrasp.ablate import AblationCfg, ablate
+from pgdm.pregrasp.ablation.ablate import AblationCfg, ablate
 from pgdm.pregrasp.sources import PregraspCfg, start_state
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.randomize import Randomizer
-from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
+from pgdm.sim.scene import WARP, HandCfg, Scene, SimCfg, TaskCfg, build_scene
 from pgdm.wrist.plan import WristPlan, WristProblem
 
 TRAIN = "train"
-"""Stream of the simulations that a policy is trained in."""
+"""Random stream of the simulations that a policy is trained in."""
 
 _AWAY_M = 0.1
-"""Further than this from its first target, an object does not start where its motion begins."""
+"""A larger distance between object and first target at the start is reported."""
 _FAR_M = 0.01
-"""Clipped by more than this, an expert's hand is not where the person's was."""
+"""An expert's hand that is clipped by more than this is reported."""
 
 
 @dataclass(frozen=True)
 class EnvCfg:
-    """What an environment is made of."""
+    """Settings of an environment."""
 
     task: TaskCfg
     hand: HandCfg
@@ -48,17 +50,18 @@ class EnvCfg:
     action: ActionCfg
     reference: ReferenceCfg
     shaping: ShapingCfg | None = None
-    """What trainings add; None: nothing."""
+    """What training adds to reward and discount; None: nothing."""
 
 
 class EnvBuilder:
-    """Compiles a task once and makes batches of it.
+    """Compiles a task once and builds batches of it.
 
     Args:
-        library: with the task's assets.
-        cfg: what the environment is made of.
+        library: library with the task's assets.
+        cfg: settings of the environment.
         recipe: the method's.
-        plan: gives the plan of the wrist, where the action wants one.
+        plan: returns the wrist plan, if the action uses one; None if it is not computed yet: the
+            base then follows the clipped path.
 
     Raises:
         PgdmError: if the library lacks an asset, the scene does not compile, the start state is
@@ -70,7 +73,7 @@ class EnvBuilder:
         library: Library,
         cfg: EnvCfg,
         recipe: Recipe,
-        plan: Callable[[WristProblem], WristPlan],
+        plan: Callable[[WristProblem], WristPlan | None],
     ) -> None:
         self.scene: Scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
         self.motion = library.motion(cfg.task.motion)
@@ -94,27 +97,34 @@ class EnvBuilder:
             cfg.action.hold_steps,
             cfg.action.carry_load,
         )
-        self.wrist = plan(self.wrist_problem) if cfg.action.plans_wrist else None
+        action, self.wrist = cfg.action, None
+        if action.plans_wrist:
+            self.wrist = plan(self.wrist_problem)
+            action = action if self.wrist else replace(action, wrist_path="clipped")
         commands = None if self.wrist is None else torch.from_numpy(self.wrist.commands)
         self.mdp = Mdp(
             reference=reference,
             start=start,
             observe=layout(cfg.obs, index, reference),
-            actions=action_map(cfg.action, index, reference, qpos, commands),
+            actions=action_map(action, index, reference, qpos, commands),
             recipe=recipe,
             expert=None if self.expert is None else _followed(self.expert, self.scene),
         )
 
     @property
     def notes(self) -> list[str]:
-        """Sentences that say what differs from what was asked for, or from other tasks."""
+        """Sentences on how the environment deviates from its settings or its task from others."""
         task, used = self.scene.task.id, self.mdp.start.source
         notes = []
+        if self._cfg.sim.engine == WARP:
+            notes.append(
+                "training in MuJoCo Warp: the first run of a scene compiles its kernels, which "
+                "takes one to three minutes; evaluations run in C MuJoCo"
+            )
         if used != (wanted := self._cfg.pregrasp.source):
             notes.append(
-                f"{task} has no start '{wanted}' in the assets of "
-                f"{self.scene.asset_source}; starting from '{used}' ('pgdm pregrasp reach {task}' "
-                "plans one)"
+                f"the {self.scene.asset_source} assets have no '{wanted}' start of {task}; "
+                f"starting from '{used}' ('pgdm pregrasp reach {task}' plans one)"
             )
         if (note := self._away_from_target()) is not None:
             notes.append(note)
@@ -122,26 +132,26 @@ class EnvBuilder:
         if unknown and self._cfg.sim.object_mass == "published":
             notes.append(
                 f"sim.object_mass=published: the published mass of {unknown} is not known; "
-                "the mass by volume stays"
+                "keeping the mass by volume"
             )
         if self.ablated is not None:
             ablation = self._cfg.ablation
-            if told := self.ablated.compromises(ablation.distance_m):
-                notes.append(f"ablation={ablation.name} of {task}: {told}")
+            if deviation := self.ablated.compromises(ablation.distance_m):
+                notes.append(f"ablation={ablation.name} of {task}: {deviation}")
         if self.expert is not None and self.expert.approximate:
             notes.append(
-                f"the expert hand trajectory of {task} is approximate: it was rebuilt from another "
-                "recording, as the published one is empty"
+                f"the expert hand trajectory of {task} is approximate: the published one is empty, "
+                "so it was rebuilt from another recording"
             )
         if (beyond := self._expert_beyond_m()) > _FAR_M:
             notes.append(
                 f"the expert's hand of {task} leaves the robot's limits by up to {beyond:.2f} m; "
-                "methods follow it clipped to them, that far from the object"
+                "methods follow it clipped to the limits, that far from the object"
             )
         return notes
 
     def _away_from_target(self) -> str | None:
-        """Return a sentence if the object starts far from its first target, with both points."""
+        """Return a sentence with both points if the object starts far from its first target."""
         sim = SimBatch(self.scene, 1, 1, self.motion.substeps)
         sim.reset(np.array([0]), self.mdp.start.qpos, self.mdp.start.qvel)
         start, target = sim.read().object_pos[0], self.mdp.reference.pos[0]
@@ -154,13 +164,13 @@ class EnvBuilder:
         )
 
     def _expert_beyond_m(self) -> float:
-        """Return by how much the base of the expert's hand leaves its limits at most."""
+        """Return how far the base of the expert's hand leaves its limits at most, m."""
         if self.expert is None or self.mdp.expert is None:
             return 0.0
         return float(np.abs(self.expert.qpos - self.mdp.expert.joints.numpy())[:, :3].max())
 
     def facts(self) -> dict[str, str]:
-        """Return what a result depends on besides its configuration and the program."""
+        """Return what a result depends on besides configuration and program: sources and hashes."""
         facts = {
             "asset_source": self.scene.asset_source,
             "motion_sha256": self.motion.sha256,
@@ -181,19 +191,19 @@ class EnvBuilder:
         return facts
 
     def differences(self, recorded: Mapping[str, Any]) -> Iterator[str]:
-        """Yield what of a run's recorded facts is not so here."""
+        """Yield which recorded facts of a run differ from this environment's, as text."""
         for key, now in self.facts().items():
             if recorded.get(key) != now:
-                told = f"{key} '{recorded.get(key)}', and the library now has '{now}'"
-                yield told + (self._recentred() if key == "scene_sha256" else "")
+                text = f"{key} '{recorded.get(key)}', and the library now has '{now}'"
+                yield text + (self._recentred() if key == "scene_sha256" else "")
 
     def _recentred(self) -> str:
-        """Return what is to be said of an older run's scene, if its tracked body is massless."""
+        """Return why an older run's scene differs if the tracked body is massless; else empty."""
         if self.scene.model.body_mass[self.scene.index.object_body] > 0:
             return ""
         return (
             f" (the tracked body {self.scene.task.tracked_body} is massless: its centre of mass is "
-            "now its origin, and lay elsewhere in runs of earlier versions)"
+            "now its origin, but was another point in earlier versions)"
         )
 
     def make(
@@ -204,18 +214,69 @@ class EnvBuilder:
         stream: str = TRAIN,
         auto_reset: bool = True,
         dump_dir: Path | None = None,
+        device: str = "cpu",
     ) -> BatchEnv:
         """Return N simulations of the task; see `BatchEnv` for the arguments.
 
-        ``stream`` names what the simulations are for: each has random numbers of its own, and
-        those for ``train`` have the shaping.
+        ``stream`` names the purpose of the simulations: each draws its own random numbers, and
+        only ``train`` has the shaping and the configured engine, on ``device``; all others are
+        simulated by C MuJoCo.
+
+        Raises:
+            ConfigError: if there are fewer than one simulation, they do not fit into the memory,
+                or the engine is not installed or cannot use the device.
         """
+        check_count("num_envs", num_envs, 1)
+        check_count("num_threads", num_threads, 0)
         mdp, shaping = self.mdp, self._cfg.shaping
         if shaping is not None and stream == TRAIN:
             mdp = replace(mdp, recipe=shaped(mdp.recipe, shaping))
-        sim = SimBatch(self.scene, num_envs, num_threads, self.motion.substeps)
+        if stream == TRAIN and self._cfg.sim.engine == WARP:
+            from pgdm.sim.warp import WarpBatch  # an optional dependency
+
+            sim = WarpBatch(self.scene, num_envs, self.motion.substeps, device)
+            mdp = self._on(sim.device, mdp)
+        else:
+            if num_envs > 1:
+                self.check_memory("num_envs" if stream == TRAIN else "eval.episodes", num_envs)
+            sim = SimBatch(self.scene, num_envs, num_threads, self.motion.substeps)
         randomize = Randomizer(seed, stream, num_envs) if self.scene.task.randomize else None
         return BatchEnv(sim, mdp, randomize, auto_reset, dump_dir)
+
+    def _on(self, device: torch.device, mdp: Mdp) -> Mdp:
+        """Return an MDP whose tensors are on a device."""
+        mdp = replace(
+            mdp,
+            reference=_moved(mdp.reference, device),
+            actions=_moved(mdp.actions, device),
+            expert=_moved(mdp.expert, device),
+        )
+        return replace(mdp, observe=layout(self._cfg.obs, self.scene.index, mdp.reference))
+
+    @cached_property
+    def probe(self) -> BatchEnv:
+        """One simulation, for sizes."""
+        return self.make(1, 1, stream=TRAIN if self._cfg.sim.engine != WARP else "probe")
+
+    def check_memory(self, key: str, num_envs: int, others_bytes: float = 0.0) -> None:
+        """Check that so many simulations, and others_bytes besides, fit into the free memory.
+
+        Raises:
+            ConfigError: if they do not; names the key.
+        """
+        on_device = key == "num_envs" and self._cfg.sim.engine == WARP
+        each = 0 if on_device else self.probe.sim.bytes_each
+        needed = num_envs * each + others_bytes
+        check_fits(f"{key}={num_envs}", needed, f"use a smaller {key}")
+
+
+def _moved(value: Any, device: torch.device) -> Any:
+    """Return a dataclass, or None, with all its tensors on a device."""
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    return replace(value, **{f.name: _moved(getattr(value, f.name), device) for f in fields(value)})
 
 
 def _point(pos: torch.Tensor) -> str:
@@ -223,8 +284,7 @@ def _point(pos: torch.Tensor) -> str:
 
 
 def _reference(cfg: ReferenceCfg, stored: ObjectReference, scene: Scene) -> ObjectReference:
-    if cfg.frame not in FRAMES:
-        raise UnknownNameError("reference frame", cfg.frame, FRAMES)
+    check_name("reference frame", cfg.frame, FRAMES)
     if cfg.frame == "released":
         return stored
     com = scene.model.body_ipos[scene.index.object_body].copy()
@@ -232,7 +292,7 @@ def _reference(cfg: ReferenceCfg, stored: ObjectReference, scene: Scene) -> Obje
 
 
 def _followed(expert: Expert, scene: Scene) -> ExpertReference:
-    model, nu = scene.model, scene.index.num_actuators
-    low, high = torch.from_numpy(model.jnt_range[:nu].copy()).unbind(1)
+    model, n = scene.model, scene.index.num_joints
+    low, high = torch.from_numpy(model.jnt_range[:n].copy()).unbind(1)
     com = torch.from_numpy(model.body_ipos[scene.index.object_body].copy())
     return ExpertReference.of(expert, low, high, com)

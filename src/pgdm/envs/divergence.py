@@ -1,4 +1,4 @@
-"""The last states and actions of every simulation, kept for the ones that diverge."""
+"""Keeps the last states and targets of all simulations, and dumps those that diverge."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from pgdm.sim.batch import SimBatch
+from pgdm.sim.batch import Array, SimBatch, Simulations
 
 _log = logging.getLogger(__name__)
 
 KEPT_STEPS = 10
-MAX_DUMPS = 20  # a badly broken scene must not fill the disk
+MAX_DUMPS = 20  # so that a broken scene does not fill the disk
 
 
 class History:
@@ -22,31 +23,33 @@ class History:
 
     Args:
         sim: the simulations.
-        folder: where dumps go; None keeps nothing.
+        folder: folder of the dumps; None keeps nothing.
     """
 
-    def __init__(self, sim: SimBatch, folder: Path | None) -> None:
+    def __init__(self, sim: Simulations, folder: Path | None) -> None:
         self._sim, self._folder = sim, folder
-        n, nu = sim.num_envs, sim.scene.model.nu
-        self._states = np.zeros((KEPT_STEPS, n, sim.rows.shape[1]))
-        self._ctrl = np.zeros((KEPT_STEPS, n, nu))
+        kept = 0 if folder is None else KEPT_STEPS
+        rows = torch.as_tensor(sim.rows)
+        self._states = torch.zeros((kept, *rows.shape), dtype=rows.dtype, device=sim.device)
+        targets = (kept, sim.num_envs, sim.scene.model.nu)
+        self._ctrl = torch.zeros(targets, dtype=torch.float64, device=sim.device)
         self._count = 0
 
-    def record(self, ctrl: np.ndarray) -> None:
-        """Keep the states as they are, and the targets (N, nu) about to be applied to them."""
+    def record(self, ctrl: Array) -> None:
+        """Keep the present states, and the targets (N, nu) about to be applied to them."""
         if self._folder is None:
             return
         slot = self._count % KEPT_STEPS
-        self._states[slot] = self._sim.rows
-        self._ctrl[slot] = ctrl
+        self._states[slot] = torch.as_tensor(self._sim.rows)
+        self._ctrl[slot] = torch.as_tensor(ctrl)
         self._count += 1
 
     def dump(self, sims: list[int], steps: list[int]) -> None:
-        """Write the last states and targets of simulations, oldest first, to one file each.
+        """Write the last states and targets of simulations to one file each, oldest first.
 
         Args:
             sims: which simulations.
-            steps: their control steps since reset, so that nothing of an earlier episode is kept.
+            steps: their control steps since reset, so that no earlier episode is included.
         """
         _log.warning("%d simulation(s) diverged in '%s'", len(sims), self._sim.scene.task.id)
         if self._folder is None:
@@ -57,27 +60,34 @@ class History:
             kept = range(self._count - min(count, KEPT_STEPS, self._count), self._count)
             order = [k % KEPT_STEPS for k in kept]
             content: dict[str, Any] = {
-                "states": self._states[order, sim],
-                "ctrl": self._ctrl[order, sim],
+                "states": self._states[order, sim].cpu().numpy(),
+                "ctrl": self._ctrl[order, sim].cpu().numpy(),
             }
             if self._sim.scene.index.randomized_geom is not None:
-                friction, half_width = self._sim.contact()
-                content |= {"friction": friction[sim], "half_width": half_width[sim]}
+                names = ("friction", "half_width", "mass")
+                varied = zip(names, self._sim.variation(), strict=True)
+                content |= {name: values[sim] for name, values in varied}
             path = self._folder / f"{time.time_ns()}-sim{sim}.npz"
             np.savez(path, task=np.array(self._sim.scene.task.id), **content)
             _log.warning("its last %d states and targets: %s", len(order), path)
 
 
 def replay(path: Path, sim: SimBatch) -> np.ndarray:
-    """Step a dump again in ``sim``, one simulation of the same scene.
+    """Simulate a dump again.
+
+    Args:
+        path: path of the dump.
+        sim: one simulation of the same scene.
 
     Returns:
-        The states after each step, (K, nstate); the last one is where it diverged.
+        The states after each step, (K, nstate); at the last one it diverged.
     """
     with np.load(path) as dump:
         stored = dict(dump)
     if "friction" in stored:
-        sim.set_contact(np.array([0]), stored["friction"][None], stored["half_width"][None])
+        mass = stored.get("mass", sim.variation()[2][0])  # earlier versions did not vary it
+        drawn = (stored["friction"], stored["half_width"], mass)
+        sim.set_variation(np.array([0]), *(np.array([value]) for value in drawn))
     sim.restore(stored["states"][:1])
     after = []
     for target in stored["ctrl"]:

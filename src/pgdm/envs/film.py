@@ -1,22 +1,23 @@
-"""Films: a policy at work, an exemplar motion by itself, and with the expert's hand."""
+"""Videos: a policy at work, and given states of a scene."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from torch import Tensor
 
 from pgdm.envs.batch_env import BatchEnv
+from pgdm.library.progress import StepProgress, silent
 from pgdm.motion.reference import ObjectReference
+from pgdm.sim.draw import Shots, draw
 from pgdm.sim.render import Renderer, write_image, write_video
-from pgdm.sim.replay import motion_qpos
 from pgdm.sim.scene import Scene
-from pgdm.wrist.plan import WristPlan
 
-_CLOSE_M = 0.4  # height of the picture around the object where contacts are to be seen
-LAST_FRAME_REPEATS = 12  # half a second to see how it ended
+_CLOSE_M = 0.4  # height of the picture around the object when contacts are shown
+LAST_FRAME_REPEATS = 12  # half a second of the final state
 
 Act = Callable[[Tensor], Tensor]
 
@@ -27,136 +28,90 @@ def film_policy(env: BatchEnv, act: Act, path: Path) -> Path:
     Args:
         env: one simulation, ``auto_reset=False``.
         act: observations (1, D) -> actions (1, A).
-        path: of the MP4.
+        path: path of the MP4.
 
     Raises:
         RenderError: if no OpenGL works here or the file cannot be written.
     """
-    with _renderer(env.sim.scene, env.mdp.reference) as renderer:
-        return write_video(path, _episode(env, act, renderer), round(1 / env.sim.control_dt_s))
-
-
-def _episode(env: BatchEnv, act: Act, renderer: Renderer) -> Iterator[np.ndarray]:
+    scene, rows, captions = env.sim.scene, [], []
     obs, done = env.reset(), False
     while True:
-        t = int(env.t[0])
-        goal = env.mdp.reference.pos[t].numpy(), env.mdp.reference.quat[t].numpy()
         error_cm = 100 * float(env.object_error()[0])
-        caption = f"{env.sim.scene.task.id}  step {t}  error {error_cm:.1f} cm"
-        frame = renderer.render(env.sim.data(0), goal, caption)
-        yield frame
+        captions.append(f"{scene.task.id}  step {int(env.t[0])}  error {error_cm:.1f} cm")
+        rows.append(env.sim.data(0).qpos.copy())
         if done:
             break
         obs, _, terminated, truncated, _ = env.step(act(obs))
         done = bool(terminated[0] or truncated[0])
-    for _ in range(LAST_FRAME_REPEATS):
-        yield frame
+    clip = Clip(scene, env.mdp.reference, np.array(rows), captions, ghost=True)
+    pictures = list(_drawn(clip))
+    fps = round(1 / env.sim.control_dt_s)
+    return write_video(path, [*pictures, *pictures[-1:] * LAST_FRAME_REPEATS], fps)
 
 
-def film_motion(env: BatchEnv, path: Path) -> Path:
-    """Write an MP4 of the exemplar motion with the hand at its pre-grasp; return its poster.
+@dataclass(frozen=True)
+class Clip:
+    """States of a task's scene at the control steps, to be shown one a frame."""
 
-    Kinematic: nothing is simulated. Where the followed body has six joints of its own the object
-    itself moves, else only its ghost.
+    scene: Scene
+    reference: ObjectReference
+    """The object's motion, which the picture covers."""
+    qpos: np.ndarray  # (K, nq)
+    captions: Sequence[str]
+    """Text of each frame, (K,)."""
+    ghost: bool = False
+    """Whether to draw the target as a translucent object."""
+    marks: Sequence[np.ndarray] | None = None
+    """Points (n, 3) m, world frame, to show as small spheres in each frame, with a camera that
+    follows the object."""
+    hold: bool = False
+    """Whether to repeat the last frame, which is then the poster."""
+
+
+def film_clip(clip: Clip, fps: int, path: Path, progress: StepProgress = silent) -> Path:
+    """Write an MP4 of a clip; return its poster.
 
     Args:
-        env: the task, in any state.
-        path: of the MP4.
+        clip: what to show.
+        fps: frames a second.
+        path: path of the MP4.
+        progress: reports the frames drawn.
 
     Raises:
         RenderError: if no OpenGL works here or the file cannot be written.
     """
-    scene, reference = env.sim.scene, env.mdp.reference
-    qpos = motion_qpos(scene, env.mdp.start.qpos, reference)
-    with _renderer(scene, reference) as renderer:
-        frames = (
-            renderer.render_qpos(
-                qpos[t],
-                (reference.pos[t].numpy(), reference.quat[t].numpy()),
-                f"{scene.task.id}  exemplar motion  {t}/{len(reference) - 1}",
-            )
-            for t in range(len(reference))
-        )
-        return write_video(path, frames, round(1 / env.sim.control_dt_s))
+    pictures = []
+    progress("opening OpenGL", 0, 1)
+    for picture in _drawn(clip):
+        progress("drawing", len(pictures), len(clip.qpos))
+        pictures.append(picture)
+    progress("encoding", 0, 1)
+    held = pictures[-1:] * LAST_FRAME_REPEATS if clip.hold else []
+    poster = write_video(path, [*pictures, *held], fps)
+    return write_image(poster, pictures[-1]) if clip.hold else poster
 
 
-def film_reach(env: BatchEnv, qpos: np.ndarray, path: Path) -> Path:
-    """Write an MP4 of the way to the pre-grasp; return its poster, where it ends.
-
-    Args:
-        env: the task, in any state.
-        qpos: joint positions (K+1, nq) at the control steps.
-        path: of the MP4.
-
-    Raises:
-        RenderError: if no OpenGL works here or the file cannot be written.
-    """
-    scene, last = env.sim.scene, len(qpos) - 1
-    with _renderer(scene, env.mdp.reference) as renderer:
-        pictures = [
-            renderer.render_qpos(row, None, f"{scene.task.id}  reach  {t}/{last}")
-            for t, row in enumerate(qpos)
-        ]
-    held = pictures[-1:] * LAST_FRAME_REPEATS
-    poster = write_video(path, [*pictures, *held], round(1 / env.sim.control_dt_s))
-    return write_image(poster, pictures[-1])
+def _drawn(clip: Clip) -> Iterator[np.ndarray]:
+    """Yield the pictures of a clip, drawn by another process: no driver may end a run."""
+    scene, reference, steps = clip.scene, clip.reference, np.arange(len(clip.qpos))
+    shots = Shots(
+        scene.model,
+        scene.index.object_body,
+        reference.pos.numpy(),
+        clip.qpos,
+        clip.captions,
+        goal(reference, steps) if clip.ghost else None,
+        clip.marks,
+        _CLOSE_M if clip.marks else None,
+    )
+    return draw(shots)
 
 
-def film_wrist(env: BatchEnv, plan: WristPlan, path: Path) -> Path:
-    """Write an MP4 of the hand alone on its planned way, the goal as a ghost; return its poster.
-
-    Args:
-        env: the task, in any state.
-        plan: of its wrist.
-        path: of the MP4.
-
-    Raises:
-        RenderError: if no OpenGL works here or the file cannot be written.
-    """
-    scene, reference = env.sim.scene, env.mdp.reference
-    errors_cm = 100 * np.append(0.0, plan.error_m)
-    with _renderer(scene, reference) as renderer:
-        frames = (
-            renderer.render_qpos(
-                row,
-                (reference.pos[t].numpy(), reference.quat[t].numpy()),
-                f"{scene.task.id}  hand alone  step {t}  error {errors_cm[t]:.1f} cm",
-            )
-            for t, row in enumerate(plan.qpos)
-        )
-        return write_video(path, frames, round(1 / env.sim.control_dt_s))
+def renderer(scene: Scene, reference: ObjectReference) -> Renderer:
+    """Return a renderer of a scene, in this process, whose camera sees the whole motion."""
+    return Renderer(scene.model, scene.index.object_body, motion=reference.pos.numpy())
 
 
-def film_expert(
-    scene: Scene,
-    qpos: np.ndarray,
-    marks: Sequence[np.ndarray],
-    reference: ObjectReference,
-    title: str,
-    path: Path,
-) -> Path:
-    """Write an MP4 of hand and object moving as the expert's did; return its poster.
-
-    Args:
-        scene: the task's.
-        qpos: joint positions (T, nq) at the control steps.
-        marks: where fingers touch the object at each of them, (n, 3) m each, world frame.
-        reference: the object's motion, which the picture shows.
-        title: what is seen.
-        path: of the MP4.
-
-    Raises:
-        RenderError: if no OpenGL works here or the file cannot be written.
-    """
-    last = len(qpos) - 1
-    with _renderer(scene, reference, _CLOSE_M) as renderer:
-        frames = (
-            renderer.render_qpos(row, None, f"{scene.task.id}  {title}  {t}/{last}", marks[t])
-            for t, row in enumerate(qpos)
-        )
-        return write_video(path, frames)
-
-
-def _renderer(scene: Scene, reference: ObjectReference, follow_m: float | None = None) -> Renderer:
-    motion = reference.pos.numpy()
-    return Renderer(scene.model, scene.index.object_body, motion=motion, follow_m=follow_m)
+def goal(reference: ObjectReference, t: int | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the target position (3,) m and orientation (4,) wxyz at step t, or at steps (K,)."""
+    return reference.pos[t].numpy(), reference.quat[t].numpy()

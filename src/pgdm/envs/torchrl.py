@@ -1,4 +1,4 @@
-"""The TorchRL face: N simulations as one batched EnvBase."""
+"""A task as a TorchRL environment: N simulations as one batched EnvBase."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class PgdmTorchRLEnv(EnvBase):
     """A batch of one task as a TorchRL environment of batch size [N].
 
     Keys: ``observation`` (N, D) float32, ``action`` (N, A) in [-1, 1], ``reward`` (N, 1),
-    ``terminated`` (the object was lost or the motion ended), ``truncated`` (the simulation
+    ``terminated`` (the object was lost or the motion is over), ``truncated`` (the simulation
     diverged) and ``done``, (N, 1) bool; ``object_error_m`` (N, 1) m.
 
     Args:
-        batch: the task with ``auto_reset=False``: TorchRL asks for partial resets itself.
+        batch: the task with ``auto_reset=False``: TorchRL requests partial resets itself.
     """
 
     def __init__(self, batch: BatchEnv) -> None:
@@ -39,6 +39,10 @@ class PgdmTorchRLEnv(EnvBase):
         self.full_done_spec = Composite(
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,)
         )
+
+    def warm_start(self) -> torch.Tensor:
+        """Return the action (A,) at which a policy's mean starts (released code)."""
+        return self._batch.warm_start()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)

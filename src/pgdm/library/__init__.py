@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING
+
 from pgdm.library.catalog import Library, open_library
-from pgdm.library.expert_file import Expert
-from pgdm.library.motion_file import Motion, Start
-from pgdm.library.provide import ensure, ensure_expert
-from pgdm.library.registry import fetch_registry
-from pgdm.library.report import Report
-from pgdm.library.tcdm import import_tcdm
+from pgdm.library.files.expert import Expert
+from pgdm.library.files.motion import Motion, Start
+
+if TYPE_CHECKING:
+    from pgdm.library.builder import ImportSummary
+    from pgdm.library.fetch import fetch_registry
+    from pgdm.library.provide import ensure, ensure_expert
+    from pgdm.library.tcdm import import_tcdm
 
 __all__ = [
     "Expert",
+    "ImportSummary",
     "Library",
     "Motion",
-    "Report",
     "Start",
     "ensure",
     "ensure_expert",
@@ -22,3 +27,18 @@ __all__ = [
     "import_tcdm",
     "open_library",
 ]
+
+# Filling the library needs MuJoCo and SciPy, which take a second to import; reading it does not.
+_LATE = {
+    "ImportSummary": "builder",
+    "ensure": "provide",
+    "ensure_expert": "provide",
+    "fetch_registry": "fetch",
+    "import_tcdm": "tcdm",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name in _LATE:
+        return getattr(importlib.import_module(f"{__name__}.{_LATE[name]}"), name)
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

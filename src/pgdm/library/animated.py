@@ -1,39 +1,43 @@
-"""The motions that come with the program: keyframes and starts, compiled into source ``animated``.
+"""The motions that come with pgdm, compiled from keyframes into the library source ``animated``.
 
-``keyframes/<task>.yaml`` names hand and object, has the keyframes as :mod:`pgdm.library.animate`
-reads them, and where hand and object start: joint numbers that tools/animated_starts.py found.
+``keyframes/<task>.yaml`` has hand and object, the keyframes (see
+:mod:`pgdm.library.files.keyframes`) and the start state: joint positions found by
+tools/animated_starts.py.
 """
 
 from __future__ import annotations
 
-import datetime
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import mujoco
 import numpy as np
 import yaml
 
 from pgdm.errors import CorruptAssetError
-from pgdm.library import animate, figures, motion_file, staging
 from pgdm.library import manifest as manifests
-from pgdm.library.animate import Animation
+from pgdm.library import staging
 from pgdm.library.catalog import Library
-from pgdm.library.check import compiled
+from pgdm.library.files import motion as motion_file
+from pgdm.library.files.motion import Start
 from pgdm.library.manifest import FileEntry, Manifest, TaskEntry
-from pgdm.library.motion_file import Start
+from pgdm.library.tasks import SUBSTEPS
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from pgdm.library.files.keyframes import Animation
 
 FOLDER = Path(__file__).parent / "keyframes"
 TASKS = tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))
-"""Tasks whose motion comes with the program."""
+"""Tasks whose motion comes with pgdm."""
 
 LICENCE = "MIT"
 PLACE = np.array([0.0, 0.0, 0.2])
-"""Where the tasks' settings place the object body at joints zero, m."""
+"""Position of the object's body at zero joints in the tasks' settings, m."""
 
-_FORMAT = 1  # raise it where the same keyframes give another motion
+_FORMAT = 1  # to be increased when the same keyframes give another motion
 
 
 @dataclass(frozen=True)
@@ -45,9 +49,9 @@ class AnimatedTask:
     object: str
     animation: Animation
     hand_joints: np.ndarray = field(repr=False)
-    """(nu,) m and rad: the pre-grasp."""
+    """(nu,) m and rad, the pre-grasp."""
     object_joints: np.ndarray = field(repr=False)
-    """(6,) m and rad, where it rests."""
+    """(6,) m and rad, the object at rest."""
 
 
 def read(task: str) -> AnimatedTask:
@@ -56,6 +60,7 @@ def read(task: str) -> AnimatedTask:
     Raises:
         CorruptAssetError: the installation is damaged.
     """
+
     path = FOLDER / f"{task}.yaml"
     try:
         content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -63,13 +68,15 @@ def read(task: str) -> AnimatedTask:
         hand, name = str(content.pop("hand")), str(content.pop("object"))
         joints = {key: np.array(start[key], np.float64) for key in ("hand", "object")}
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CorruptAssetError(f"{path}: damaged ({error}); install pgdm anew") from error
-    animation = animate.animation(content, str(path))
+        raise CorruptAssetError(f"{path}: damaged ({error}); reinstall pgdm") from error
+    from pgdm.library.files import keyframes
+
+    animation = keyframes.animation(content, str(path))
     return AnimatedTask(task, hand, name, animation, joints["hand"], joints["object"])
 
 
 def origin() -> str:
-    """Return what the source is made of; it changes with any of the keyframes."""
+    """Return the source's origin for its manifest; it changes with any of the keyframes."""
     digest = hashlib.sha256(str(_FORMAT).encode())
     for task in TASKS:
         digest.update((FOLDER / f"{task}.yaml").read_bytes())
@@ -77,17 +84,17 @@ def origin() -> str:
 
 
 def is_current(library: Library) -> bool:
-    """Return whether the library has these motions, made of these keyframes."""
+    """Return whether the library has the motions of the current keyframes."""
     manifest = library.sources().get(staging.ANIMATED)
     return manifest is not None and manifest.origin == origin()
 
 
 def fill(root: Path, library: Library) -> None:
-    """Compile all of them into the library, for a caller who holds its lock.
+    """Compile all motions into the library, for a caller who holds its lock.
 
     Args:
         root: the library's folder.
-        library: the library, with hands and objects in it.
+        library: the library, with hands and objects.
 
     Raises:
         LibraryError: an object is missing.
@@ -95,33 +102,32 @@ def fill(root: Path, library: Library) -> None:
     """
     files: dict[str, FileEntry] = {}
     tasks: dict[str, TaskEntry] = {}
-    with staging.replacing(root, staging.ANIMATED) as folder:
+    with staging.replacing_folder(root, staging.ANIMATED) as folder:
         for task in TASKS:
-            made = read(task)
-            arrays = motion_arrays(made, library)
+            animated = read(task)
+            arrays = motion_arrays(animated, library)
             path = folder / "motions" / f"{task}.npz"
             motion_file.write(path, arrays)
-            digest, size = manifests.sha256_of(path), path.stat().st_size
-            files[f"motions/{task}.npz"] = FileEntry(
-                digest, size, f"keyframes/{task}.yaml", LICENCE
-            )
+            files[f"motions/{task}.npz"] = FileEntry.of(path, f"keyframes/{task}.yaml", LICENCE)
             steps = len(arrays["object_translation"])
-            tasks[task] = TaskEntry(made.hand, [made.object], steps, ["mined"])
-        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        content = Manifest(staging.ANIMATED, origin(), now, files=files, tasks=tasks)
+            tasks[task] = TaskEntry(animated.hand, [animated.object], steps, ["mined"])
+        content = Manifest(staging.ANIMATED, origin(), manifests.now(), files=files, tasks=tasks)
         manifests.write(folder, content)
 
 
 def motion_arrays(task: AnimatedTask, library: Library) -> dict[str, np.ndarray]:
-    """Return a task's motion as arrays of the library's form."""
+    """Return a task's motion as the arrays of its file."""
     pos, quat = task.animation.at(*_resting(task, library.object_xml(task.object)))
     qpos = np.concatenate((task.hand_joints, task.object_joints))
     start = Start(qpos, np.zeros(len(qpos)), None)
-    return motion_file.pack(pos, quat, figures.SUBSTEPS, {"mined": start})
+    return motion_file.pack(pos, quat, SUBSTEPS, {"mined": start})
 
 
 def _resting(task: AnimatedTask, object_xml: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre of mass (3,) m and orientation (4,) wxyz of the object at its start."""
+    """Return centre of mass (3,) m and orientation (4,) wxyz of the object in the start state."""
+    import mujoco
+
+    from pgdm.library.checks.compiled import compiled
 
     def place(spec: mujoco.MjSpec) -> None:
         spec.body("object").pos = PLACE

@@ -1,29 +1,47 @@
-"""Writing one source of the library into a staging folder and keeping its manifest."""
+"""Writing one library source into a staging folder, with its manifest."""
 
 from __future__ import annotations
 
-import datetime
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from pgdm.errors import CorruptAssetError
+from pgdm import limited
+from pgdm.errors import CorruptAssetError, LimitError
+from pgdm.files import read_bytes
 from pgdm.library import manifest as manifests
-from pgdm.library import model_file, motion_file, names
-from pgdm.library.check import compiled
+from pgdm.library.checks.compiled import counts
+from pgdm.library.files import model as model_file
+from pgdm.library.files import motion as motion_file
 from pgdm.library.manifest import FileEntry, Manifest, TaskEntry
-from pgdm.library.report import Report
+from pgdm.library.tasks import hand_of, objects_of
+from pgdm.paths import check_path_part
+
+
+@dataclass(frozen=True)
+class ImportSummary:
+    """Result of filling the library from one source."""
+
+    source: str
+    """``checkout`` or ``registry``."""
+    tasks: list[str]
+    """Task ids that the library now has from this source."""
+    defects: list[str]
+    """Faults in the source's files, and how they were read."""
+    left_out: dict[str, str]
+    """What the source lacks, with the reason."""
 
 
 class SourceBuilder:
-    """Collects models and motions of one source, each checked as it comes.
+    """Collects models and motions of one library source and checks each one.
 
     Args:
         folder: the staging folder to write into.
         source: ``checkout`` or ``registry``.
-        origin: where the source came from, for the manifest.
+        origin: origin of the source, for the manifest.
         root: folder to which origins in the manifest are relative.
         licence_of: SPDX licence of a path relative to ``root``.
     """
@@ -39,44 +57,61 @@ class SourceBuilder:
         self._licence_of = licence_of
         self._files: dict[str, FileEntry] = {}
         self._tasks: dict[str, TaskEntry] = {}
+        self._models: dict[str, tuple[Path, str]] = {}
         self._joints: dict[str, int] = {}
         self._actuators: dict[str, int] = {}
 
     def add_model(self, kind: str, name: str, model: ET.Element, origin: Path) -> None:
-        """Write a model, copy its files, and compile it.
+        """Write a model with its files.
 
         Args:
-            kind: ``hands``, ``objects`` or ``scene``.
+            kind: ``hands``, ``objects``, ``arms`` or ``scene``.
             name: library name.
             model: parsed MJCF.
-            origin: the file it was made from.
+            origin: the file it was derived from.
 
         Raises:
-            CorruptAssetError: a file of it is missing or MuJoCo refuses it.
+            CorruptAssetError: one of its files is missing.
+            ConfigError: its name is not valid.
         """
         relative = {
             "hands": f"hands/{name}/hand.xml",
             "objects": f"objects/{name}/object.xml",
+            "arms": f"{name}/arm.xml",
             "scene": "scene/table.xml",
         }[kind]
+        check_path_part(f"the name of {origin}", name)
         path = self.folder / relative
-        label = self._origin_name(origin)
+        label = model_file.name_in(origin, self._root)
         note = f"Made by pgdm from {label} ({self._licence_of(label)}); do not edit."
-        self._record(path, origin)
-        for written, source in model_file.write(model, path, note):
+        for written, source in [(path, origin), *model_file.write(model, path, note)]:
             self._record(written, source)
-        result = compiled(path, label)
-        self._joints[f"{kind}/{name}"] = result.nq
-        self._actuators[f"{kind}/{name}"] = result.nu
+        self._models[f"{kind}/{name}"] = path, label
+
+    def compile_models(self) -> None:
+        """Compile all models, in a child process: somebody else made them.
+
+        Raises:
+            CorruptAssetError: MuJoCo cannot compile one, or not within the limits.
+        """
+        answers = limited.each(counts, list(self._models.values()))
+        for (key, (_, label)), answer in zip(self._models.items(), answers, strict=False):
+            if isinstance(answer, LimitError):
+                raise CorruptAssetError(f"{label}: MuJoCo cannot compile it ({answer})")
+            if isinstance(answer, Exception):
+                raise answer
+            self._joints[key], self._actuators[key] = answer
 
     def add_motion(self, task: str, arrays: Mapping[str, np.ndarray], origin: Path) -> None:
-        """Write a task's motion, checked against its scene's numbers of joints and actuators.
+        """Write a task's motion after checking it against its scene's joints and actuators.
 
         Raises:
             CorruptAssetError: an array is damaged or does not fit the scene.
         """
-        label = self._origin_name(origin)
-        hand, objects = names.hand_of(task), names.objects_of(task)
+        label = model_file.name_in(origin, self._root)
+        model_file.check_stays(origin, self._root)
+        check_path_part(f"the task of {label}", task)
+        hand, objects = hand_of(task), objects_of(task)
         translation, _, _, starts = motion_file.check(arrays, label)
         joints = self._joints[f"hands/{hand}"] + sum(self._joints[f"objects/{o}"] for o in objects)
         actuators = self._actuators[f"hands/{hand}"]
@@ -88,7 +123,7 @@ class SourceBuilder:
                 )
             if start.actions is not None and start.actions.shape[1] != actuators:
                 raise CorruptAssetError(
-                    f"{label}: start '{name}' has {start.actions.shape[1]} actions a step, but "
+                    f"{label}: start '{name}' has {start.actions.shape[1]} actions per step, but "
                     f"{hand} has {actuators} actuators"
                 )
         path = self.folder / "motions" / f"{task}.npz"
@@ -97,58 +132,50 @@ class SourceBuilder:
         self._tasks[task] = TaskEntry(hand, list(objects), len(translation), list(starts))
 
     def add_file(self, relative: str, origin: Path) -> None:
-        """Copy a file as it is, such as a licence."""
+        """Copy a file unchanged, such as a licence.
+
+        Raises:
+            CorruptAssetError: it is a link to a file outside of the source.
+        """
         path = self.folder / relative
+        model_file.check_stays(origin, self._root)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(origin.read_bytes())
+        path.write_bytes(read_bytes(origin))
         self._record(path, origin)
 
     def has(self, kind: str, name: str) -> bool:
         """Return whether a hand or object was added."""
-        return f"{kind}/{name}" in self._joints
+        return f"{kind}/{name}" in self._models
 
     def lacking(self, task: str) -> list[str]:
         """Return what a task needs that was not added, such as ``object 'cup'``."""
-        hand = names.hand_of(task)
+        hand = hand_of(task)
         result = [] if self.has("hands", hand) else [f"hand '{hand}'"]
-        return result + [
-            f"object '{o}'" for o in names.objects_of(task) if not self.has("objects", o)
-        ]
+        return result + [f"object '{o}'" for o in objects_of(task) if not self.has("objects", o)]
 
-    def finish(self) -> Report:
-        """Hash all files, write the manifest, and return the report."""
-        files = {}
-        for relative, entry in sorted(self._files.items()):
-            path = self.folder / relative
-            files[relative] = FileEntry(
-                manifests.sha256_of(path), path.stat().st_size, entry.origin, entry.licence
-            )
+    def finish(self) -> ImportSummary:
+        """Write the manifest and return a summary."""
         manifests.write(
             self.folder,
             Manifest(
                 source=self._source,
                 origin=self._origin,
-                imported_at=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+                imported_at=manifests.now(),
                 defects=self.defects,
-                files=files,
-                tasks=dict(sorted(self._tasks.items())),
+                files=self._files,
+                tasks=self._tasks,
                 hands=self._names("hands"),
                 objects=self._names("objects"),
                 left_out=self.left_out,
                 notes=self.notes,
             ),
         )
-        return Report(self._source, sorted(self._tasks), self.defects, self.left_out)
+        return ImportSummary(self._source, sorted(self._tasks), self.defects, self.left_out)
 
     def _names(self, kind: str) -> list[str]:
-        return sorted(k.split("/", 1)[1] for k in self._joints if k.startswith(f"{kind}/"))
+        return sorted(k.split("/", 1)[1] for k in self._models if k.startswith(f"{kind}/"))
 
     def _record(self, path: Path, origin: Path) -> None:
-        name = self._origin_name(origin)
+        name = model_file.name_in(origin, self._root)
         relative = path.relative_to(self.folder).as_posix()
-        self._files[relative] = FileEntry("", 0, name, self._licence_of(name))
-
-    def _origin_name(self, origin: Path) -> str:
-        if origin.is_relative_to(self._root):
-            return origin.relative_to(self._root).as_posix()
-        return origin.name
+        self._files[relative] = FileEntry.of(path, name, self._licence_of(name))

@@ -1,58 +1,84 @@
-"""What the library holds and which source serves it."""
+"""The library's content, and the source that serves each task."""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from pgdm import paths
-from pgdm.errors import LibraryError, UnknownNameError
-from pgdm.library import expert_file, expert_index, motion_file, staging
+from pgdm.errors import CorruptAssetError, LibraryError, UnknownNameError
 from pgdm.library import manifest as manifests
-from pgdm.library.expert_file import Expert
-from pgdm.library.expert_index import ExpertEntry, ExpertIndex
-from pgdm.library.manifest import FileEntry, Manifest, TaskEntry
-from pgdm.library.motion_file import Motion
+from pgdm.library import staging
+from pgdm.library.files import expert as expert_file
+from pgdm.library.files import expert_index
+from pgdm.library.files import motion as motion_file
+from pgdm.library.files.expert import Expert
+from pgdm.library.files.expert_index import ExpertEntry, ExpertIndex
+from pgdm.library.files.motion import Motion
+from pgdm.library.manifest import FileEntry, Manifest, TaskEntry, sha256_of
 
 CURE = "Fill the library with 'pgdm assets fetch' or 'pgdm assets import PATH' (a TCDM checkout)."
-"""What to do when the library lacks something."""
+"""What to do if the library lacks something."""
 
 EXPERT_CURE = "Get the expert hand trajectories with 'pgdm assets fetch'."
-"""What to do when there are none."""
+"""What to do if there are none."""
 
+_log = logging.getLogger(__name__)
 
+_CURES = {staging.OWN: manifests.OWN_CURE}
+_NAMES = {staging.OWN: "your own objects, hands and tasks"}
 _PARTIAL = (staging.OWN, staging.ANIMATED)
 
 
 class Library:
-    """The assets under one root, and the user's own; a checkout wins, task by task.
+    """The assets under one root and the user's own, as they were when it was opened.
 
-    A task takes hand, objects, scene and motion all from the source that serves it. What that one
-    has none of comes from elsewhere: objects that the user made from ``own``; hands, table and
-    other objects for a motion of ``own`` or ``animated`` from the best source that is whole.
+    A task takes hand, objects, scene and motion from the one source that serves it, by precedence
+    ``own``, ``checkout``, ``registry``, ``animated``; ``pgdm assets use`` puts one of the middle
+    two first. Exceptions: the user's objects and hands always come from ``own``; other hands, the
+    table and other objects for a motion of ``own`` or ``animated`` come from the first source that
+    has hands. Each motion is read once: its arrays are shared, so copy them before changing any.
 
     Args:
         root: the library's folder.
-        sources: manifests by source name, the winning source first.
+        sources: manifests by source name, in order of precedence.
         folders: folder of each source.
     """
 
     def __init__(self, root: Path, sources: dict[str, Manifest], folders: dict[str, Path]) -> None:
         self.root, self._sources, self._folders = root, sources, folders
+        self._motions: dict[tuple[str, str], Motion] = {}
+        self._experts: ExpertIndex | None = None
+        self._unchanged: set[tuple[str, str]] = set()
 
     def sources(self) -> dict[str, Manifest]:
-        """Return the manifest of each source that is present, the winning one first."""
+        """Return the manifest of each source that is present, in order of precedence."""
         return dict(self._sources)
 
     def promising(self, task: str, entry: TaskEntry) -> Library:
-        """Return this library as it is once a task of the user's is in it, to build its scene."""
+        """Return this library with one more task of the user's, whose files are not yet written."""
         empty = Manifest(source=staging.OWN, origin="", imported_at="")
         own = self._sources.get(staging.OWN, empty)
         grown = dataclasses.replace(own, tasks={**own.tasks, task: entry})
         place = self._folders.get(staging.OWN, paths.user() / "library")
         folders = {**self._folders, staging.OWN: place}
         return Library(self.root, {**self._sources, staging.OWN: grown}, folders)
+
+    def serving(self, origins: object) -> Library:
+        """Return this library with some sources before all others.
+
+        Args:
+            origins: as a run recorded them, such as ``own+checkout``; sources that are missing
+                here, or None, change nothing.
+        """
+        present = [s for s in str(origins).split("+") if s in self._sources]
+        first = [s for s in present if s in staging.SELF_CONTAINED]
+        # The user's own stay first, as everywhere.
+        own = [s for s in self._sources if s == staging.OWN]
+        order = dict.fromkeys((*own, *first, *self._sources))
+        return Library(self.root, {s: self._sources[s] for s in order}, self._folders)
 
     def folder(self, source: str) -> Path:
         """Return the folder of a source that is present."""
@@ -75,7 +101,7 @@ class Library:
         return sorted({name for m in self._sources.values() for name in m.objects})
 
     def entry(self, task: str, source: str | None = None) -> TaskEntry:
-        """Return hand, objects, length and stored starts of a task.
+        """Return a task's hand, objects, number of steps and stored starts.
 
         Raises:
             UnknownNameError: the task is not in the library (or not from that source).
@@ -90,44 +116,57 @@ class Library:
         """
         return self._source(task, None)
 
-    def origins(self, task: str) -> str:
-        """Return the sources that serve a task, its motion's first, such as ``own+checkout``.
+    def origins(self, task: str, hand: str) -> str:
+        """Return the sources that serve a task with a hand, such as ``own+checkout``.
+
+        The motion's is first, except that ``own`` is also first for a hand of the user's.
 
         Raises:
             UnknownNameError: the task is not in the library.
         """
         source = self._source(task, None)
-        return source if source not in _PARTIAL else "+".join((source, *self._whole()[:1]))
+        used = [source] if source not in _PARTIAL else [source, *self._whole()[:1]]
+        return "+".join(dict.fromkeys(([staging.OWN] if self.is_own_hand(hand) else []) + used))
+
+    def is_own_hand(self, hand: str) -> bool:
+        """Return whether a hand is the user's own."""
+        own = self._sources.get(staging.OWN)
+        return own is not None and hand in own.hands
 
     def motion(self, motion_id: str, source: str | None = None) -> Motion:
-        """Read a task's motion.
+        """Return a task's motion; its file is read once.
 
         Raises:
             UnknownNameError: the task is not in the library (or not from that source).
             CorruptAssetError: its file is damaged.
         """
         source = self._source(motion_id, source)
-        return motion_file.read(self.motion_path(motion_id, source), motion_id, source)
+        if (key := (motion_id, source)) not in self._motions:
+            path = self.motion_path(motion_id, source)
+            self._motions[key] = motion_file.read(path, motion_id, source)
+        return self._motions[key]
 
     def motion_path(self, motion_id: str, source: str | None = None) -> Path:
         """Return the file of a task's motion."""
-        source = self._source(motion_id, source)
-        return self._existing(source, f"motions/{motion_id}.npz")
+        return self._existing(self._source(motion_id, source), f"motions/{motion_id}.npz")
 
     def experts(self) -> ExpertIndex:
-        """Return which tasks have an expert hand trajectory, with provenance and quality.
+        """Return the index of the expert hand trajectories; its file is read once.
 
         Raises:
-            CorruptAssetError: their index is damaged.
+            CorruptAssetError: it is damaged.
         """
-        folder = staging.folder_of(self.root, staging.EXPERTS)
-        return ExpertIndex("", {}, {}) if folder is None else expert_index.read(folder)
+        if self._experts is None:
+            folder = staging.folder_of(self.root, staging.EXPERTS)
+            empty = ExpertIndex("", {}, {})
+            self._experts = empty if folder is None else expert_index.read(folder)
+        return self._experts
 
     def expert_entry(self, task: str) -> ExpertEntry:
         """Return provenance and quality of a task's expert hand trajectory.
 
         Raises:
-            UnknownNameError: the task has none; names those that have one.
+            UnknownNameError: the task has none; names the tasks that have one.
         """
         index = self.experts()
         if task not in index.experts:
@@ -141,9 +180,9 @@ class Library:
         """Read a task's expert hand trajectory.
 
         Raises:
-            UnknownNameError: the task has none; names those that have one.
+            UnknownNameError: the task has none; names the tasks that have one.
             CorruptAssetError: its file is damaged.
-            LibraryError: it was made for a motion of another length.
+            LibraryError: its length differs from the motion's.
         """
         self.expert_entry(task)
         folder = staging.folder_of(self.root, staging.EXPERTS)
@@ -158,7 +197,7 @@ class Library:
         return expert
 
     def files(self) -> Iterator[tuple[str, Path, FileEntry]]:
-        """Yield every file that the manifests list: its name for messages, path and entry."""
+        """Yield name (for messages), path and entry of every file in the manifests."""
         for source, manifest in self._sources.items():
             for name, entry in manifest.files.items():
                 yield f"{source}/{name}", self._folders[source] / name, entry
@@ -174,9 +213,15 @@ class Library:
         Raises:
             UnknownNameError: the hand is not in the library (or not from that source).
         """
+        relative = f"hands/{hand}/hand.xml"
+        if self.is_own_hand(hand):
+            return self._existing(staging.OWN, relative)
         have = {s: self._sources[s].hands for s in self._whole()}
-        found = self._serving("hand", hand, self._whole_of(source), have)
-        return self._existing(found, f"hands/{hand}/hand.xml")
+        if have and not any(hand in names for names in have.values()):
+            raise UnknownNameError(
+                "hand", hand, self.hands(), "'pgdm author hand' makes one from MJCF or URDF"
+            )
+        return self._model("hand", hand, source, have, relative)
 
     def object_xml(self, object_name: str, source: str | None = None) -> Path:
         """Return the MJCF file of an object.
@@ -184,12 +229,11 @@ class Library:
         Raises:
             UnknownNameError: the object is not in the library (or not from that source).
         """
-        own = self._sources.get(staging.OWN)
+        own, relative = self._sources.get(staging.OWN), f"objects/{object_name}/object.xml"
         if own is not None and object_name in own.objects:
-            return self._existing(staging.OWN, f"objects/{object_name}/object.xml")
+            return self._existing(staging.OWN, relative)
         have = {s: self._sources[s].objects for s in self._whole()}
-        found = self._serving("object", object_name, self._whole_of(source), have)
-        return self._existing(found, f"objects/{object_name}/object.xml")
+        return self._model("object", object_name, source, have, relative)
 
     def scene_xml(self, source: str | None = None) -> Path:
         """Return the MJCF file of the table scene.
@@ -198,17 +242,22 @@ class Library:
             LibraryError: the library is empty.
         """
         have = {s: ["table"] for s in self._whole()}
-        found = self._serving("scene", "table", self._whole_of(source), have)
-        return self._existing(found, "scene/table.xml")
+        return self._model("scene", "table", source, have, "scene/table.xml")
+
+    @property
+    def is_filled(self) -> bool:
+        """Whether there are a table and the benchmark's hands."""
+        return bool(self._whole())
 
     def _whole(self) -> list[str]:
-        """Return the sources that have hands and a table, the winning one first."""
+        """Return the sources with hands and a table, in order of precedence."""
         return [source for source in self._sources if source not in _PARTIAL]
 
-    @staticmethod
-    def _whole_of(source: str | None) -> str | None:
-        """Return the source that is asked for hands and table, None for the best one."""
-        return None if source in _PARTIAL else source
+    def _model(
+        self, kind: str, name: str, source: str | None, have: dict[str, list[str]], relative: str
+    ) -> Path:
+        wanted = None if source in _PARTIAL else source
+        return self._existing(self._serving(kind, name, wanted, have), relative)
 
     def _source(self, task: str, source: str | None) -> str:
         have = {s: list(m.tasks) for s, m in self._sources.items()}
@@ -230,29 +279,59 @@ class Library:
         path = self._folders[source] / relative
         if not path.is_file():
             raise LibraryError(
-                f"{path}: missing from the library, though its manifest lists it. {CURE}"
+                f"{path}: missing from the library, although its manifest lists it. {CURE}"
             )
+        self._check_unchanged(source, relative)
         return path
+
+    def _check_unchanged(self, source: str, relative: str) -> None:
+        """Compare a file, and for a model its meshes, with the manifest; once."""
+        if (source, relative) in self._unchanged:
+            return
+        model = f"{relative.rpartition('/')[0]}/" if relative.endswith(".xml") else relative
+        for name, entry in self._sources[source].files.items():
+            path = self._folders[source] / name
+            if name.startswith(model) and path.is_file() and sha256_of(path) != entry.sha256:
+                own = "Create it again with 'pgdm author', or get your copy back."
+                raise CorruptAssetError(
+                    f"{path}: was changed after it came into the library, its SHA-256 is not the "
+                    f"recorded one. {own if source == staging.OWN else CURE}"
+                )
+        self._unchanged.add((source, relative))
 
 
 def open_library(root: Path | None = None) -> Library:
-    """Open the library; reads its manifests only.
+    """Open the library; reads only its manifests.
 
     Args:
         root: its folder, by default the one under ``PGDM_HOME``.
 
     Raises:
-        CorruptAssetError: a manifest is damaged.
+        CorruptAssetError: a manifest is damaged, and no other source has hands; otherwise its
+            source is left out with a warning.
     """
     root = paths.library() if root is None else Path(root)
-    folders: dict[str, Path] = {}
-    for source in staging.SOURCES:
-        folder = staging.folder_of(*_place(root, source))
-        if folder is not None:
-            folders[source] = folder
-    return Library(root, {s: manifests.read(f) for s, f in folders.items()}, folders)
+    folders = present(root)
+    found: dict[str, Manifest] = {}
+    damaged: dict[str, CorruptAssetError] = {}
+    for source, folder in folders.items():
+        try:
+            found[source] = manifests.read(folder, _CURES.get(source, manifests.CURE))
+        except CorruptAssetError as error:
+            damaged[source] = error
+    for source, error in damaged.items():
+        if source in staging.SELF_CONTAINED and not set(found) & set(staging.SELF_CONTAINED):
+            raise error  # nothing else has hands
+        _log.warning("%s; continuing without %s", error, _NAMES.get(source, f"source '{source}'"))
+    return Library(root, found, folders).serving(staging.preferred(root))
+
+
+def present(root: Path) -> dict[str, Path]:
+    """Return the folder of each source that is there, damaged or not, in order of precedence."""
+    found = {source: staging.folder_of(*_place(root, source)) for source in staging.SOURCES}
+    return {source: folder for source, folder in found.items() if folder is not None}
 
 
 def _place(root: Path, source: str) -> tuple[Path, str]:
-    """Return the folder in which a source's folder lies, and the latter's name."""
+    """Return the parent of a source's folder, and the folder's name."""
     return (paths.user(), "library") if source == staging.OWN else (root, source)

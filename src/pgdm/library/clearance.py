@@ -1,7 +1,9 @@
-"""Moving a hand out of what it penetrates by a small change of its joints."""
+"""Freeing a hand from penetration by a small change of its joints, found by search."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -9,23 +11,97 @@ import numpy as np
 
 from pgdm.cem import CemCfg, CrossEntropy
 from pgdm.errors import CorruptAssetError
+from pgdm.library.couplings import Couplings
 
 CLEARANCE_M = 0.0005
-"""Distance that is kept, the contact margin of the benchmark's models."""
+"""Distance that is kept: the contact margin of the benchmark's models."""
 
-_SPREAD = (0.01, 0.05)
-"""First spread of the search: m of the sliding joints, rad of the turning ones."""
-_CEM, _ROUNDS = CemCfg(64, 8, added=0.02), 40
-_DEPTH_WEIGHT = 1e3
-"""Cost of a metre of penetration, against squared spreads of movement."""
+_ROUNDS, _ELITES, _ADDED = 40, 8, 0.02
 _OBJECT_HEIGHT_M = 0.2
 
 
-def moved_out(table: Path, hand: Path, thing: Path, qpos: np.ndarray) -> np.ndarray:
-    """Return joint positions near ``qpos`` at which the hand touches nothing.
+@dataclass(frozen=True)
+class FreeingCfg:
+    """Settings of :func:`free_by_search`: step sizes, cost weights, effort."""
 
-    A cross-entropy search over the hand's joints: the parts of a thin wall push to both sides, so
-    that following the contacts' normals goes astray. Same input, same result.
+    slide_m: float
+    """Standard deviation of the first samples of slide joints."""
+    hinge_rad: float
+    """Standard deviation of the first samples of hinge joints."""
+    depth_weight: float
+    """Cost of a metre of penetration."""
+    move_weight: float = 1.0
+    """Cost of moving every joint by its standard deviation."""
+    population: int = 64
+    """Samples per round."""
+    patience: int = _ROUNDS
+    """Rounds without a better free pose after which the search stops."""
+    negligible_m: float = 0.0
+    """Penetration up to this counts as none."""
+
+
+LIBRARY_START = FreeingCfg(slide_m=0.01, hinge_rad=0.05, depth_weight=1e3)
+"""Settings for starts that the library stores."""
+
+
+def free_by_search(
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    num_joints: int,
+    depth: Callable[[np.ndarray], float],
+    cfg: FreeingCfg,
+    away: Callable[[np.ndarray], float] = lambda qpos: 0.0,
+    seed: int = 0,
+) -> tuple[np.ndarray, bool]:
+    """Return the state near ``qpos`` with the least penetration, and whether it has none.
+
+    A cross-entropy search over offsets z of the hand's joints h, in standard deviations s:
+
+        h(z) = clip(h_0 + s z)        cost(z) = away + depth_weight * depth + move_weight * |z|^2/n
+
+    Of two states the one with less ``depth`` is better, and of equally deep ones the cheaper.
+    Following contact normals instead goes astray: the parts of a thin wall push to both sides.
+    Equal arguments give an equal result.
+
+    Args:
+        model: its first joints are the hand's.
+        qpos: whole state (nq,); objects stay where they are.
+        num_joints: number of the hand's joints, n.
+        depth: penetration of a state (nq,), m.
+        cfg: settings of the search.
+        away: cost of a state (nq,) for leaving what it should stay near.
+        seed: seed of the samples.
+    """
+    low, high = model.jnt_range[:num_joints].T
+    is_slide = model.jnt_type[:num_joints] == mujoco.mjtJoint.mjJNT_SLIDE
+    scale = np.where(is_slide, cfg.slide_m, cfg.hinge_rad)
+    start, state = qpos[:num_joints].clip(low, high), qpos.copy()
+    couplings = Couplings(model, num_joints)
+    stream = np.random.Generator(np.random.PCG64(seed))
+    cem = CemCfg(cfg.population, _ELITES, added=_ADDED)
+    search = CrossEntropy(np.zeros(num_joints), np.ones(num_joints), cem, stream)
+    best, best_rank, waited = state, (np.inf, np.inf), 0
+    for _ in range(_ROUNDS):
+        moves = search.ask()
+        costs = np.empty(len(moves))
+        waited += best_rank[0] <= cfg.negligible_m
+        for i, move in enumerate(moves):
+            state[:num_joints] = (start + scale * move).clip(low, high)
+            couplings.apply(state)
+            inside = depth(state)
+            moved = cfg.move_weight * float(move @ move) / num_joints
+            costs[i] = away(state) + cfg.depth_weight * inside + moved
+            rank = max(inside, cfg.negligible_m), costs[i]
+            if rank < best_rank:
+                best, best_rank, waited = state.copy(), rank, 0
+        if waited >= cfg.patience:
+            break
+        search.tell(moves, costs)
+    return best, best_rank[0] <= cfg.negligible_m
+
+
+def moved_out(table: Path, hand: Path, thing: Path, qpos: np.ndarray) -> np.ndarray:
+    """Return joint positions (nq,) near ``qpos`` at which the hand touches nothing.
 
     Args:
         table: MJCF of the scene.
@@ -36,52 +112,34 @@ def moved_out(table: Path, hand: Path, thing: Path, qpos: np.ndarray) -> np.ndar
     Raises:
         CorruptAssetError: no such position was found.
     """
-    model, joints = _scene(table, hand, thing)
+    model = _scene(table, hand, thing)
     data = mujoco.MjData(model)
-    low, high = model.jnt_range[:joints].T
-    slides = model.jnt_type[:joints] == mujoco.mjtJoint.mjJNT_SLIDE
-    scale = np.where(slides, *_SPREAD)
-    start = qpos[:joints].clip(low, high)
-    data.qpos[:] = qpos
-    stream = np.random.Generator(np.random.PCG64(0))
-    search = CrossEntropy(np.zeros(joints), np.ones(joints), _CEM, stream)
-    best, best_cost = start, np.inf
-    for _ in range(_ROUNDS):
-        moves = search.ask()
-        costs = np.empty(len(moves))
-        for i, move in enumerate(moves):
-            data.qpos[:joints] = (start + scale * move).clip(low, high)
-            depth = _penetration(model, data)
-            costs[i] = _DEPTH_WEIGHT * depth + float(move @ move) / joints
-            if depth == 0.0 and costs[i] < best_cost:
-                best, best_cost = data.qpos[:joints].copy(), costs[i]
-        search.tell(moves, costs)
-    if not np.isfinite(best_cost):
+    names = [model.body(body).name for body in model.geom_bodyid]
+    of_hand = np.array([name.startswith("hand/") for name in names])
+    joints = sum(model.joint(i).name.startswith("hand/") for i in range(model.njnt))
+
+    def depth(state: np.ndarray) -> float:
+        """Return by how much the hand's contacts are below the clearance, summed, m."""
+        data.qpos[:] = state
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        first, second = of_hand[data.contact.geom].T
+        total = 0.0  # in the contacts' order: stored starts depend on the last bit
+        for dist in data.contact.dist[first != second].tolist():
+            total += max(CLEARANCE_M - dist, 0.0)
+        return total
+
+    found, is_free = free_by_search(model, qpos, joints, depth, LIBRARY_START)
+    if not is_free:
         raise CorruptAssetError(f"{thing.parent.name}: the hand cannot be moved out of the object")
-    return np.concatenate((best, qpos[joints:]))
+    return found
 
 
-def _scene(table: Path, hand: Path, thing: Path) -> tuple[mujoco.MjModel, int]:
+def _scene(table: Path, hand: Path, thing: Path) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_file(str(table))
-    for prefix, path in (("hand/", hand), ("thing/", thing)):
+    for prefix, path in (("hand/", hand), ("object/", thing)):
         part = mujoco.MjSpec.from_file(str(path))
         spec.attach(part, prefix=prefix, frame=spec.worldbody.add_frame())
-    spec.body("thing/object").pos = (0.0, 0.0, _OBJECT_HEIGHT_M)
-    model = spec.compile()
-    return model, sum(model.joint(i).name.startswith("hand/") for i in range(model.njnt))
-
-
-def _penetration(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """Return by how much the hand's contacts with other things are too close in all, m."""
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_collision(model, data)
-    total = 0.0
-    for contact in data.contact:
-        first, second = (
-            model.body(model.geom_bodyid[g]).name.startswith("hand/")
-            for g in (contact.geom1, contact.geom2)
-        )
-        if first != second and contact.dist < CLEARANCE_M:
-            total += CLEARANCE_M - float(contact.dist)
-    return total
+    spec.body("object/object").pos = (0.0, 0.0, _OBJECT_HEIGHT_M)
+    return spec.compile()

@@ -1,19 +1,33 @@
-"""The index of one library source: what is in it, where from, and every file's hash."""
+"""The index of one library source: its content, where it came from, and every file's hash."""
 
 from __future__ import annotations
 
+import datetime
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from pgdm import files, paths
 from pgdm.errors import CorruptAssetError
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 FORMAT = 1
-"""Version of the library's layout; a library of another one must be made anew."""
+"""Version of the library's layout; a library of another version must be filled again."""
 
 NAME = "manifest.json"
 """The manifest's file name in a source's folder."""
+
+CURE = "fill the library again with 'pgdm assets fetch' or 'pgdm assets import PATH'"
+OWN_CURE = (
+    "restore it from a copy, or move its folder away and make the objects, hands and tasks again "
+    "with 'pgdm author'"
+)
+_Content = TypeVar("_Content")
 
 
 @dataclass(frozen=True)
@@ -21,13 +35,18 @@ class FileEntry:
     """One file of the library."""
 
     sha256: str
-    """Hash of the file as it lies in the library."""
+    """Hash of the file in the library."""
     bytes: int
     """Its size."""
     origin: str
-    """Path it was made from, relative to the source's root."""
+    """Path of the file it was derived from, relative to the source's root."""
     licence: str
-    """SPDX name of the licence its source gives."""
+    """SPDX name of the licence its source states."""
+
+    @classmethod
+    def of(cls, path: Path, origin: str, licence: str) -> FileEntry:
+        """Hash and measure a file."""
+        return cls(sha256_of(path), path.stat().st_size, origin, licence)
 
 
 @dataclass(frozen=True)
@@ -37,7 +56,7 @@ class TaskEntry:
     hand: str
     """Library name of the hand."""
     objects: list[str]
-    """Library names of the objects, the followed one first."""
+    """Library names of the objects, the tracked one first."""
     steps: int
     """Length T of the motion, control steps."""
     starts: list[str]
@@ -49,13 +68,13 @@ class Manifest:
     """Content of ``manifest.json``."""
 
     source: str
-    """``checkout`` or ``registry``."""
+    """Name of the library source, such as ``checkout``."""
     origin: str
     """Where it came from: a package with version and hash, or a folder's name."""
     imported_at: str
     """UTC time, ISO 8601."""
     defects: list[str] = field(default_factory=list)
-    """What was wrong in the source's files and how it was read."""
+    """Faults in the source's files, and how they were read."""
     files: dict[str, FileEntry] = field(default_factory=dict)
     """Files by path relative to the source's folder."""
     tasks: dict[str, TaskEntry] = field(default_factory=dict)
@@ -65,46 +84,65 @@ class Manifest:
     objects: list[str] = field(default_factory=list)
     """Objects that are complete here."""
     left_out: dict[str, str] = field(default_factory=dict)
-    """Tasks, hands or objects the source should have but lacks, with the reason."""
+    """Tasks, hands or objects that the source lacks, with the reason."""
     notes: dict[str, list[str]] = field(default_factory=dict)
-    """By task, what is known to differ from the benchmark's released data."""
+    """Known differences from the benchmark's released data, by task."""
     format: int = FORMAT
     """Layout version."""
 
 
 def write(folder: Path, manifest: Manifest) -> None:
     """Write the manifest into a source's folder."""
-    text = json.dumps(asdict(manifest), indent=1, sort_keys=True)
-    (folder / NAME).write_text(text + "\n", encoding="utf-8")
+    write_json(folder / NAME, manifest)
 
 
-def read(folder: Path) -> Manifest:
+def read(folder: Path, cure: str = CURE) -> Manifest:
     """Read a source's manifest.
 
     Raises:
         CorruptAssetError: it is missing, damaged or of another format.
     """
-    path = folder / NAME
-    cure = "make the library anew with 'pgdm assets fetch' or 'pgdm assets import PATH'"
+    return read_json(folder / NAME, _from_json, FORMAT, cure)
+
+
+def _from_json(data: dict[str, Any]) -> Manifest:
+    files = {name: FileEntry(**entry) for name, entry in data["files"].items()}
+    tasks = {name: TaskEntry(**entry) for name, entry in data["tasks"].items()}
+    return Manifest(**{**data, "files": files, "tasks": tasks})
+
+
+def write_json(path: Path, content: DataclassInstance) -> None:
+    """Write an index with a ``format``, whole or not at all."""
+    text = json.dumps(asdict(content), indent=1, sort_keys=True)
+    with paths.replacing(path) as temp:
+        temp.write_text(text + "\n", encoding="utf-8")
+
+
+def read_json(
+    path: Path, build: Callable[[dict[str, Any]], _Content], version: int, cure: str
+) -> _Content:
+    """Read an index that :func:`write_json` wrote, and build its content.
+
+    Raises:
+        CorruptAssetError: it is missing, damaged or of another format; the message has the cure.
+    """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if data["format"] != FORMAT:
-            raise CorruptAssetError(f"{path}: library format {data['format']!r}; {cure}")
-        return Manifest(
-            **{
-                **data,
-                "files": {name: FileEntry(**entry) for name, entry in data["files"].items()},
-                "tasks": {name: TaskEntry(**entry) for name, entry in data["tasks"].items()},
-            }
-        )
+        data = files.read_json(path)
+        if data["format"] != version:
+            raise CorruptAssetError(f"{path}: format {data['format']!r}, not {version}; {cure}")
+        return build(data)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CorruptAssetError(f"{path}: unreadable manifest ({error}); {cure}") from error
+        raise CorruptAssetError(
+            f"{path}: unreadable manifest ({files.reason(error)}); {cure}"
+        ) from error
+
+
+def now() -> str:
+    """Return the UTC time, ISO 8601, to the second."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file, hexadecimal."""
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+    with files.open_file(path) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,8 +1,8 @@
-"""How much heavier objects were in the MuJoCo of the paper's time than in MuJoCo 4.0.
+"""Ratio of objects' masses in MuJoCo 2.2, from the paper's time, to those in MuJoCo 4.0.
 
-Each object of a TCDM checkout was compiled with MuJoCo 2.2 and with 4.0. The older one computes the
-volume of a mesh differently; 4.0's mass is density times true volume. Objects with a given mass or
-made of boxes have ratio 1. Centres of mass differ as well, by up to 1.6 mm, which is left as it is.
+Each object of a TCDM checkout was compiled with both versions, which compute the volume of a mesh
+differently; in 4.0 the mass is density times true volume. Objects with a given mass or made of
+boxes have ratio 1. Centres of mass also differ, by up to 1.6 mm; this is not corrected.
 """
 
 from __future__ import annotations

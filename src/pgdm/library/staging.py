@@ -1,8 +1,8 @@
-"""Changing the library all at once or not at all.
+"""Atomic changes to the library.
 
-A source is written into a folder of its own beside the library's and takes its place by renaming,
-under a lock that other imports wait for. Whatever an interrupted import leaves behind is ignored by
-readers and removed by the next import.
+A folder of the library is written under a temporary name and takes the old one's place by renaming,
+under a lock that other processes wait for. Readers ignore whatever an interrupted change leaves
+behind; the next change removes it.
 """
 
 from __future__ import annotations
@@ -19,82 +19,67 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from pgdm.errors import LibraryError
+from pgdm.files import read_text
+from pgdm.library.progress import Notify
+from pgdm.paths import replacing
 
-WHOLE = ("checkout", "registry")
-"""Sources that have hands and a table of their own, the one that wins first."""
+SELF_CONTAINED = ("checkout", "registry")
+"""Library sources with their own hands and table scene, by decreasing precedence."""
 
 OWN = "own"
-"""Source of what the user made; it lies in the user's folder, not in the library's."""
+"""Library source of the user's objects, hands and tasks; it is in the user's folder."""
 
 ANIMATED = "animated"
-"""Source of the motions that come with the program, compiled from its keyframes."""
+"""Library source of the motions that come with pgdm, compiled from keyframes."""
 
-SOURCES = (OWN, *WHOLE, ANIMATED)
-"""Library sources, the one that wins first."""
+SOURCES = (OWN, *SELF_CONTAINED, ANIMATED)
+"""Library sources by decreasing precedence."""
 
 EXPERTS = "experts"
-"""Folder of the expert hand trajectories, which belong to no source: they fit either one's."""
+"""Folder of the expert hand trajectories. They belong to no source: they fit the motions of
+both `checkout` and `registry`."""
 
-_MAKING_TIMEOUT_S = 3600.0
-_STAGING = ".staging-"
-_PREVIOUS = ".previous-"
+_TIMEOUT_S = 3600.0  # fetching over a slow connection takes long
+_STAGING, _PREVIOUS = ".staging-", ".previous-"
+_FIRST = "first-source"
 _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def locked(root: Path, timeout_s: float = 3600.0) -> Iterator[None]:
-    """Hold the library's lock, which is not to be asked for again while it is held.
+def locked(root: Path, timeout_s: float = _TIMEOUT_S) -> Iterator[None]:
+    """Hold the lock of a library; it is not reentrant.
 
     Args:
         root: the library.
-        timeout_s: how long to wait for another process; a fetch over a slow line takes its time.
+        timeout_s: how long to wait for another process.
 
     Raises:
-        LibraryError: the folder cannot be written, or another import holds the lock too long.
+        LibraryError: the folder cannot be written, or another process holds the lock too long.
     """
+    busy = f"{root}: another process has been changing the library for {timeout_s:.0f} s"
+    waiting = f"another process is changing the library in {root}: waiting for it"
     try:
-        root.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(str(root / ".lock"))
-        try:
-            lock.acquire(timeout=0.2)
-        except Timeout:
-            _log.warning("another process is filling the library in %s: waiting for it", root)
-            lock.acquire(timeout=timeout_s)
+        lock = _acquired(root / ".lock", timeout_s, lambda: _log.warning(waiting), busy)
         try:
             yield
         finally:
             lock.release()
-    except Timeout as error:
-        raise LibraryError(
-            f"{root}: another import has held the library's lock for {timeout_s:.0f} s; "
-            "wait for it or end it"
-        ) from error
     except OSError as error:
         raise LibraryError(f"{root}: cannot be written ({error.strerror or error})") from error
 
 
 @contextmanager
-def making(path: Path, notify: Callable[[str], None]) -> Iterator[None]:
-    """Hold the lock of one file that is being made; others wait for it.
+def making(path: Path, notify: Notify) -> Iterator[None]:
+    """Hold the lock of one file while it is computed; other processes wait.
 
     Raises:
-        LibraryError: the folder cannot be written, or another process holds it too long.
+        LibraryError: the folder cannot be written, or another process holds the lock too long.
     """
+    busy = f"{path}: another process has been computing it for {_TIMEOUT_S:.0f} s"
+    waiting = f"another process is computing {path}: waiting for it"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(str(path.with_name(f".{path.stem}.lock")))
-        try:
-            lock.acquire(timeout=0.2)
-        except Timeout:
-            begun = time.monotonic()
-            notify(f"another process is making {path}: waiting for it")
-            lock.acquire(timeout=_MAKING_TIMEOUT_S)
-            _log.info("waited %.0f s for %s", time.monotonic() - begun, path)
-    except Timeout as error:
-        raise LibraryError(
-            f"{path}: another process has been making it for {_MAKING_TIMEOUT_S:.0f} s; wait for "
-            "it or end it"
-        ) from error
+        file = path.with_name(f".{path.stem}.lock")
+        lock = _acquired(file, _TIMEOUT_S, lambda: notify(waiting), busy)
     except OSError as error:
         raise LibraryError(f"{path}: cannot be written ({error.strerror or error})") from error
     try:
@@ -103,27 +88,53 @@ def making(path: Path, notify: Callable[[str], None]) -> Iterator[None]:
         lock.release()
 
 
+def _acquired(file: Path, timeout_s: float, on_wait: Callable[[], None], busy: str) -> FileLock:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(str(file))
+    try:
+        try:
+            lock.acquire(timeout=0.2)
+        except Timeout:
+            begun = time.monotonic()
+            on_wait()
+            lock.acquire(timeout=timeout_s)
+            _log.info("waited %.0f s for %s", time.monotonic() - begun, file)
+    except Timeout as error:
+        raise LibraryError(f"{busy}; wait for it or stop it") from error
+    return lock
+
+
 @contextmanager
-def replacing(root: Path, source: str) -> Iterator[Path]:
-    """Yield an empty folder that becomes the source's if the block ends without an error.
+def replacing_folder(root: Path, relative: str) -> Iterator[Path]:
+    """Yield an empty folder that replaces a folder of the library if the block succeeds.
 
     The caller holds :func:`locked`.
+
+    Args:
+        root: the locked folder.
+        relative: the folder to replace, at most two levels below, such as ``objects/cup``.
     """
     _clear(root)
-    staging = Path(tempfile.mkdtemp(prefix=f"{_STAGING}{source}-", dir=root))
-    # mkdtemp makes it private; a library may be shared like any other folder.
-    staging.chmod(0o755)
+    target = root / relative
+    fresh = Path(tempfile.mkdtemp(prefix=f"{_STAGING}{target.name}-", dir=root))
+    # mkdtemp makes it private, but a library may be shared like any other folder.
+    fresh.chmod(0o755)
     try:
-        yield staging
-        _swap(root, source, staging)
+        yield fresh
+        target.parent.mkdir(exist_ok=True)
+        previous = target.with_name(f"{_PREVIOUS}{target.name}")
+        if target.exists():
+            os.replace(target, previous)
+        os.replace(fresh, target)
+        shutil.rmtree(previous, ignore_errors=True)
     finally:
-        shutil.rmtree(staging, ignore_errors=True)
+        shutil.rmtree(fresh, ignore_errors=True)
 
 
 def folder_of(root: Path, source: str) -> Path | None:
-    """Return the folder a source is read from, None where there is none.
+    """Return the folder that a library source is read from, None if missing.
 
-    If an import was killed between its two renames, the previous content still serves.
+    If a change was interrupted between its two renames, the previous content is used.
     """
     for folder in (root / source, root / f"{_PREVIOUS}{source}"):
         if (folder / "manifest.json").is_file():
@@ -131,21 +142,41 @@ def folder_of(root: Path, source: str) -> Path | None:
     return None
 
 
-def _swap(root: Path, source: str, staging: Path) -> None:
-    target, previous = root / source, root / f"{_PREVIOUS}{source}"
-    if target.exists():
-        os.replace(target, previous)
-    os.replace(staging, target)
-    shutil.rmtree(previous, ignore_errors=True)
+def prefer(root: Path, source: str) -> None:
+    """Have a library source serve every task that it has, before all others."""
+    with locked(root), replacing(root / _FIRST) as temp:
+        temp.write_text(f"{source}\n", encoding="utf-8")
+
+
+def preferred(root: Path) -> str | None:
+    """Return the source chosen with :func:`prefer`, or None."""
+    try:
+        return read_text(root / _FIRST).strip()
+    except (OSError, ValueError):
+        return None
+
+
+def remove(root: Path, source: str) -> None:
+    """Delete a library source.
+
+    Raises:
+        LibraryError: the folder cannot be written, or another process holds the lock too long.
+    """
+    with locked(root):
+        _clear(root)
+        gone = root / f"{_STAGING}{source}-removed"  # a reader sees all of it or nothing
+        os.replace(root / source, gone)
+        shutil.rmtree(gone)
 
 
 def _clear(root: Path) -> None:
+    """Remove what interrupted changes left; put a folder back whose replacement never arrived."""
     for leftover in root.glob(f"{_STAGING}*"):
-        _log.info("removing %s, left by an interrupted import", leftover.name)
+        _log.info("removing %s, left by an interrupted change", leftover.name)
         shutil.rmtree(leftover, ignore_errors=True)
-    for source in (*WHOLE, ANIMATED, EXPERTS):
-        previous = root / f"{_PREVIOUS}{source}"
-        if previous.exists() and (root / source).exists():
+    for previous in (*root.glob(f"{_PREVIOUS}*"), *root.glob(f"*/{_PREVIOUS}*")):
+        target = previous.with_name(previous.name.removeprefix(_PREVIOUS))
+        if target.exists():
             shutil.rmtree(previous, ignore_errors=True)
-        elif previous.exists():
-            os.replace(previous, root / source)
+        else:
+            os.replace(previous, target)

@@ -1,1 +1,1 @@
-"""The MDP as short pure functions: observations, actions, rewards, ends, metrics."""
+"""The MDP as short pure functions: observations, actions, rewards, terminations, metrics."""

@@ -1,72 +1,103 @@
-"""From the policy's numbers in [-1, 1] to actuator targets."""
+"""From the policy's output in [-1, 1] to actuator targets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.errors import ConfigError, check_name
 from pgdm.motion.reference import ObjectReference
 from pgdm.sim.scene import SceneIndex
 from pgdm.wrist.path import PATHS
 
-Act = Callable[[Tensor, Tensor], Tensor]
-"""Actions (n, nu) and steps since reset (n,) -> actuator targets (n, nu) float64, m and rad."""
-
-# R, trainers/util: the warm start closes the fingers a little and lowers the wrist's second joint.
+# The released code's warm start bends wrist and fingers a little, and moves the second slide.
 WARM_START_OFFSET = 0.2
 
+KINDS = ("absolute", "residual")
 PLANNED = "planned"
 WRIST_PATHS = (PLANNED, *PATHS)
 
 
 @dataclass(frozen=True)
 class ActionCfg:
-    """What an action means (SPEC 1 and 7)."""
+    """What an action means."""
 
     kind: str
-    """``absolute``: joint targets (the paper); ``residual``: the wrist follows the motion and the
-    policy corrects it."""
+    """``absolute``: joint position targets (the paper); ``residual``: the base follows the
+    exemplar motion and the policy adds a correction."""
     lead_steps: int
-    """Residual: steps by which the wrist's target runs ahead, against the servo's lag."""
+    """Residual: control steps by which the base's command leads the motion, against servo lag."""
     residual_scale: float
-    """Residual: largest correction as a share of half the actuator's range (0..1)."""
+    """Residual: largest correction as a fraction of the half-range of each base joint (0..1)."""
     wrist_path: str
     """Residual: ``planned`` (see `pgdm.wrist.plan`), ``carried``, ``clipped`` or ``feasible`` (see
     `pgdm.wrist.path`)."""
     hold_steps: int
-    """Only ``planned``: control steps for which the hand stays at its pre-grasp, so that the
-    fingers can close, and then as many to catch up."""
+    """Only ``planned``: control steps for which the hand stays at its pre-grasp while the fingers
+    close; it catches up in as many."""
 
     carry_load: bool
-    """Only ``planned``: whether the commands compensate for the object's weight from when the
-    exemplar lifts it."""
+    """Only ``planned``: whether the commands compensate for the object's weight once the motion
+    lifts it."""
 
     @property
     def plans_wrist(self) -> bool:
-        """Whether the wrist's commands are planned beforehand."""
+        """Whether the base's commands are planned before training."""
         return self.kind == "residual" and self.wrist_path == PLANNED
 
 
 @dataclass(frozen=True)
+class WristPrior:
+    """Targets of the b base joints at each step, which a residual action corrects; m and rad."""
+
+    path: Tensor  # (T, b)
+    lead_steps: int
+    largest: Tensor  # (b,) correction at an action of 1
+    low: Tensor  # (b,) control range
+    high: Tensor  # (b,)
+
+    def targets(self, action: Tensor, t: Tensor) -> Tensor:
+        """Return targets (n, b) for the base's part of an action, (n, b), at steps t (n,)."""
+        ahead = self.path[(t + self.lead_steps).clamp(max=len(self.path) - 1)]
+        return torch.clamp(ahead + self.largest * action, self.low, self.high)
+
+
+@dataclass(frozen=True)
 class ActionMap:
-    """How actions become targets, and the action that a policy's mean should start from."""
+    """How actions become targets, and the action at which a policy's mean should start."""
 
-    act: Act
+    middle: Tensor  # (nu,) of each actuator's control range, m and rad
+    half: Tensor  # (nu,) half-width of that range
     warm_start: Tensor  # (nu,) in [-1, 1]
+    wrist: WristPrior | None = None
+
+    def act(self, action: Tensor, t: Tensor) -> Tensor:
+        """Return actuator targets (n, nu) float64, m and rad.
+
+        Args:
+            action: (n, nu), clipped to [-1, 1].
+            t: (n,) steps since reset.
+        """
+        action = action.double().clamp(-1.0, 1.0)
+        target = action * self.half + self.middle
+        if self.wrist is not None:
+            base = self.wrist.low.numel()
+            target[:, :base] = self.wrist.targets(action[:, :base], t)
+        return target
 
 
-_Kind = Callable[[ActionCfg, SceneIndex, ObjectReference, Tensor, Tensor | None], ActionMap]
+def _range(index: SceneIndex) -> tuple[Tensor, Tensor]:
+    """Return middle and half-width of each actuator's control range, (nu,) m and rad."""
+    low, high = torch.from_numpy(index.ctrl_low), torch.from_numpy(index.ctrl_high)
+    return 0.5 * (high + low), 0.5 * (high - low)
 
 
 def normalize(index: SceneIndex, qpos: Tensor) -> Tensor:
-    """Return the action (nu,) whose absolute target is the robot's part of qpos (nq,), clipped."""
-    low, high = torch.from_numpy(index.ctrl_low), torch.from_numpy(index.ctrl_high)
-    joints = qpos[: index.num_actuators]
-    return ((joints - 0.5 * (high + low)) / (0.5 * (high - low))).clamp(-1.0, 1.0)
+    """Return the action (nu,) whose absolute target is the hand's part of qpos (nq,), clipped."""
+    middle, half = _range(index)
+    return ((qpos[index.driven] - middle) / half).clamp(-1.0, 1.0)
 
 
 def _warm_start(index: SceneIndex, start: Tensor) -> Tensor:
@@ -76,61 +107,37 @@ def _warm_start(index: SceneIndex, start: Tensor) -> Tensor:
     return warm.clamp(-1.0, 1.0)
 
 
-def absolute(
-    cfg: ActionCfg,
-    index: SceneIndex,
-    reference: ObjectReference,
-    start: Tensor,
-    commands: Tensor | None,
-) -> ActionMap:
-    """Return the paper's map: affine from [-1, 1] to each actuator's control range."""
-    low, high = torch.from_numpy(index.ctrl_low), torch.from_numpy(index.ctrl_high)
-    middle, half = 0.5 * (high + low), 0.5 * (high - low)
-    warm = _warm_start(index, start)
-    return ActionMap(lambda a, t: a.double().clamp(-1.0, 1.0) * half + middle, warm)
+def _absolute(index: SceneIndex, start: Tensor) -> ActionMap:
+    middle, half = _range(index)
+    return ActionMap(middle, half, _warm_start(index, start))
 
 
 def warm_targets(index: SceneIndex, start: Tensor) -> Tensor:
-    """Return the targets (nu,) at which an untrained policy holds the fingers; m and rad."""
-    low, high = torch.from_numpy(index.ctrl_low), torch.from_numpy(index.ctrl_high)
-    return 0.5 * (high + low) + 0.5 * (high - low) * _warm_start(index, start)
+    """Return the targets (nu,) of the warm start, m and rad: where fingers are held untrained."""
+    middle, half = _range(index)
+    return middle + half * _warm_start(index, start)
 
 
-def residual(
+def _residual(
     cfg: ActionCfg,
     index: SceneIndex,
     reference: ObjectReference,
     start: Tensor,
     commands: Tensor | None,
 ) -> ActionMap:
-    """Return the map in which the exemplar motion moves the wrist and the policy corrects it."""
-    base = absolute(cfg, index, reference, start, None)
+    base = _absolute(index, start)
     n = index.num_base_joints
     if commands is None and cfg.wrist_path == PLANNED:
         raise ConfigError("action.wrist_path=planned needs the commands of a plan")
     if commands is None:
         path, lead = PATHS[cfg.wrist_path](index, reference, start), cfg.lead_steps
-    else:  # they know how the servos lag
+    else:  # they account for the lag of the servos
         path, lead = torch.cat((commands, commands[-1:])), 0
-    low, high = torch.from_numpy(index.ctrl_low), torch.from_numpy(index.ctrl_high)
-    reach = cfg.residual_scale * 0.5 * (high - low)[:n]
-
-    def act(a: Tensor, t: Tensor) -> Tensor:
-        target = base.act(a, t)
-        ahead = path[(t + lead).clamp(max=len(reference) - 1)]
-        wrist = ahead + reach * a[:, :n].double().clamp(-1.0, 1.0)
-        target[:, :n] = torch.clamp(wrist, low[:n], high[:n])
-        return target
-
+    low, high = torch.from_numpy(index.ctrl_low)[:n], torch.from_numpy(index.ctrl_high)[:n]
+    largest = cfg.residual_scale * 0.5 * (high - low)
     warm = base.warm_start.clone()
     warm[:n] = 0.0
-    return ActionMap(act, warm)
-
-
-KINDS: dict[str, _Kind] = {
-    "absolute": absolute,
-    "residual": residual,
-}
+    return replace(base, warm_start=warm, wrist=WristPrior(path, lead, largest, low, high))
 
 
 def action_map(
@@ -140,20 +147,29 @@ def action_map(
     start: Tensor,
     commands: Tensor | None = None,
 ) -> ActionMap:
-    """Return the configured map for a task that starts in qpos ``start`` (nq,).
+    """Return the configured map for a task that starts at qpos ``start``.
+
+    Absolute (the paper): target = middle + half * a, with middle and half-width of each actuator's
+    control range. Warm start (released code): the joint positions of the start in these units, plus
+    0.2 on entry 1 and on every entry from 6 on, clipped to [-1, 1].
+
+    Residual (pgdm's own): the same for the fingers; with the wrist path b, the base joints are
+    commanded to b(min(t + lead_steps, T-1)) + residual_scale * half * a, clipped to their ranges.
+    The commands of a wrist plan have no lead. The warm start is 0 for the base.
 
     Args:
         cfg: what an action means.
-        index: of the scene.
-        reference: the exemplar.
+        index: index of the scene.
+        reference: the exemplar motion.
         start: qpos (nq,) at the start.
-        commands: of the wrist at each step (T-1, 6), m and rad, if it is planned.
+        commands: those of the wrist plan, base targets at each step (T-1, 6), m and rad, if any.
 
     Raises:
         UnknownNameError: if there is no such kind or path.
+        ConfigError: if the base's path is planned and ``commands`` is missing.
     """
-    if cfg.wrist_path not in WRIST_PATHS:
-        raise UnknownNameError("action.wrist_path value", cfg.wrist_path, WRIST_PATHS)
-    if cfg.kind not in KINDS:
-        raise UnknownNameError("action kind", cfg.kind, KINDS)
-    return KINDS[cfg.kind](cfg, index, reference, start, commands)
+    check_name("action.wrist_path value", cfg.wrist_path, WRIST_PATHS)
+    check_name("action kind", cfg.kind, KINDS)
+    if cfg.kind == "absolute":
+        return _absolute(index, start)
+    return _residual(cfg, index, reference, start, commands)

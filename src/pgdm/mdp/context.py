@@ -1,4 +1,4 @@
-"""What the terms of an MDP are computed from, once per control step."""
+"""Input of the MDP's terms, built once per control step."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from pgdm.sim.batch import SimState
 from pgdm.sim.scene import SceneIndex
 
 SPACES = ("fingertips", "joints")
-"""In what two hands are compared."""
+"""Quantities in which the hand is compared with the expert's."""
 FORMS = ("squared", "norm")
-"""How a difference becomes a number: |d|^2 or |d|."""
+"""Forms of a distance: |d|^2 or |d|."""
 
 
 @dataclass(frozen=True)
 class StepContext:
-    """State of n simulations after a step, beside the targets of that step."""
+    """State of n simulations after a step, and the targets of that step."""
 
     state: SimState
     t: Tensor  # (n,) int64, steps since reset
-    last_t: int  # T-1, index of the motion's last pose
+    last_t: int  # T-1, index of the last pose of the motion
     target_pos: Tensor  # (n, 3) m, where the object's centre of mass should be
     target_quat: Tensor  # (n, 4) wxyz
     start_height: Tensor  # (n,) m, height of the object's centre of mass at reset
@@ -35,12 +35,12 @@ class StepContext:
 
     @cached_property
     def object_error(self) -> Tensor:
-        """Distance of the object's centre of mass from its target, (n,) m."""
+        """e, distance of the object's centre of mass from its target, (n,) m."""
         return torch.linalg.vector_norm(self.target_pos - self.state.object_pos, dim=-1)
 
     @cached_property
     def object_angle(self) -> Tensor:
-        """Angle between the object and its target, (n,) rad in [0, pi]."""
+        """phi, angle between the object and its target, (n,) rad in [0, pi]."""
         return rotations.angle(self.state.object_quat, self.target_quat)
 
     @cached_property
@@ -50,8 +50,8 @@ class StepContext:
 
     @cached_property
     def joints(self) -> Tensor:
-        """Positions of the hand's joints, (n, nu) m and rad."""
-        return self.state.qpos[:, : self.index.num_actuators]
+        """Positions of the hand's joints, coupled ones too, (n, J) m and rad."""
+        return self.state.qpos[:, : self.index.num_joints]
 
     @cached_property
     def fingertip_offset(self) -> Tensor:
@@ -60,31 +60,30 @@ class StepContext:
 
     @cached_property
     def joint_offset(self) -> Tensor:
-        """Joints minus the expert's at the same step, (n, nu) m and rad."""
+        """Joints minus the expert's at the same step, (n, J) m and rad."""
         return self.joints - self._expert.joints[self.t]
 
     @cached_property
     def in_contact(self) -> Tensor:
-        """Which of the expert's fingers touch the object at the same step, (n, F) bool."""
+        """Whether each of the expert's fingers touches the object at the same step, (n, F) bool."""
         return self._expert.in_contact[self.t]
 
     @cached_property
     def contact_points(self) -> Tensor:
-        """The expert's contact points on the object where it is now, (n, F, 3) m."""
+        """The expert's contact points on the object in its current pose, (n, F, 3) m."""
         s = self.state
         return self._expert.contact_points(self.t, s.object_pos, s.object_quat)
 
     @cached_property
     def contact_distance(self) -> Tensor:
-        """Distance of each fingertip from its contact point, in contact or not, (n, F) m."""
+        """Distance of each fingertip from the expert's contact point, (n, F) m; contact or not."""
         return torch.linalg.vector_norm(self.contact_points - self.fingertips, dim=-1)
 
     def hand_error(self, space: str, form: str) -> Tensor:
-        """Return how far the hand is from the expert's, (n,).
+        """Return |h - h_expert|^2 (``squared``) or |h - h_expert| (``norm``), (n,).
 
-        The hand is one vector: its fingertips' 3 F coordinates, m, or its nu joints, of which the
-        slides are in m and the hinges in rad. ``squared`` is the square of the difference's
-        length, ``norm`` the length itself.
+        h is one vector: the 3 F coordinates of the fingertips, m (``fingertips``), or the J joint
+        positions, m for slides and rad for hinges (``joints``).
         """
         squared = self._squared_fingertips if space == "fingertips" else self._squared_joints
         return squared if form == "squared" else squared.sqrt()
@@ -101,7 +100,7 @@ class StepContext:
     def _expert(self) -> ExpertReference:
         if self.expert is None:
             raise ConfigError(
-                "a term of this method compares with an expert, but its recipe does not say so; "
-                "make it with Recipe(..., needs_expert=True)"
+                "a term of this method compares the hand with an expert's, but its recipe does not "
+                "declare it: use Recipe(..., needs_expert=True)"
             )
         return self.expert

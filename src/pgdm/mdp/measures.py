@@ -1,4 +1,4 @@
-"""What is measured of every step beside the reward: one value a simulation, in plain units."""
+"""Measures: quantities recorded at every step in plain units, one value per simulation."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ def fingertip_error(c: StepContext) -> Tensor:
 
 
 def finger_joint_error(c: StepContext) -> Tensor:
-    """Return the angle between a joint and the expert's, mean over all but the base, (n,) rad."""
+    """Return |q - q_expert|, mean over wrist and finger joints, (n,) rad."""
     return c.joint_offset[:, c.index.num_base_joints :].abs().mean(1)
 
 
 def contact_distance(c: StepContext) -> Tensor:
     """Return the distance of a fingertip from the expert's contact point on the object, (n,) m.
 
-    Mean over the fingers in contact; NaN at steps at which the expert touches nothing.
+    Mean over the fingers in contact; NaN at steps where the expert touches nothing.
     """
-    asked = c.in_contact
-    total = torch.where(asked, c.contact_distance, 0.0).sum(1)
-    return total / asked.sum(1)  # 0/0 is NaN
+    wanted = c.in_contact
+    total = torch.where(wanted, c.contact_distance, 0.0).sum(1)
+    return total / wanted.sum(1)  # 0/0 is NaN
 
 
 HAND_MEASURES = (
@@ -34,4 +34,4 @@ HAND_MEASURES = (
     Measure("hand_error_rad", finger_joint_error),
     Measure("contact_distance_m", contact_distance),
 )
-"""What tells whether an expert is followed."""
+"""How closely the hand follows the expert's."""

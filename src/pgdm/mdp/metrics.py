@@ -1,4 +1,4 @@
-"""Metrics of finished episodes (SPEC 1, Metrics)."""
+"""Metrics of finished episodes."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from pgdm.motion.reference import ObjectReference
 
 @dataclass(frozen=True)
 class MetricsCfg:
-    """What counts as success."""
+    """Thresholds of the metrics."""
 
     success_threshold_m: float
-    """Largest distance from the target at which a step counts as a success, m."""
+    """Largest object error at which a step counts as a success, m."""
     lift_height_m: float
     """Height above the start at which object and target count as lifted, m."""
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Object poses of k episodes; rows after an episode's end are not read."""
+    """Object poses of k episodes; rows after an episode's last step are not read."""
 
     pos: Tensor  # (k, T, 3) m; row 0 is the pose at reset
     quat: Tensor  # (k, T, 4) wxyz
@@ -35,14 +35,26 @@ def episode_metrics(
 ) -> dict[str, Tensor]:
     """Return the metrics of k finished episodes, each (k,) float64.
 
-    Targets are x_1..x_{T-1}; an episode that ended early keeps its last pose for the rest, and
-    its unreached steps count as not lifted. ``success`` and ``lifted`` are shares (0..1),
-    ``com_error`` is in m, ``ori_error`` in rad, ``com_error_released`` is the Frobenius norm of
-    the (T-1, 3) difference over T-1, in m: the error column of the paper's tables.
+    With targets x_t, object positions o_t, e_t = |x_t - o_t| and the angle phi_t between object and
+    target, over t = 1..T-1 (an episode that stopped early keeps its last pose for the rest):
+
+    - ``success``: mean of [e_t <= success_threshold_m] (paper and released code);
+    - ``com_error``: mean of e_t, m (the paper's definition);
+    - ``com_error_released``: sqrt(sum of e_t^2) / (T-1), m (released code; the error column of the
+      paper's tables);
+    - ``ori_error``: mean of phi_t, rad;
+    - ``lifted``: of the steps whose target is at least lift_height_m above the object's start, the
+      fraction in which the object is too (not after a stop); NaN without such steps;
+    - ``dropped``: 1 if the object was lifted and later below that height while its target was
+      above, else 0;
+    - ``length``: steps taken.
+
+    The last three are pgdm's own.
     """
-    steps = torch.arange(1, len(reference))
+    device = episodes.length.device
+    steps = torch.arange(1, len(reference), device=device)
     held = torch.minimum(steps[None], episodes.length[:, None])  # (k, T-1)
-    row = torch.arange(len(episodes.length))[:, None]
+    row = torch.arange(len(episodes.length), device=device)[:, None]
     pos, quat = episodes.pos[row, held], episodes.quat[row, held]
     delta = pos - reference.pos[None, 1:]
     error = torch.linalg.vector_norm(delta, dim=-1)
@@ -59,7 +71,6 @@ def episode_metrics(
         "com_error": error.mean(1),
         "com_error_released": torch.linalg.matrix_norm(delta) / (len(reference) - 1),
         "ori_error": angle.mean(1),
-        # A motion that never leaves the table has nothing to lift.
         "lifted": torch.where(count > 0, up.sum(1) / count.clamp(min=1), torch.nan).double(),
         "dropped": dropped.double(),
         "length": episodes.length.double(),

@@ -1,4 +1,4 @@
-"""Observation layouts: pure functions of the state and the step (SPEC 1, Observation)."""
+"""Observation layouts: pure functions of the state and the step."""
 
 from __future__ import annotations
 
@@ -8,30 +8,33 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pgdm.errors import UnknownNameError
+from pgdm.errors import check_name
 from pgdm.motion.reference import ObjectReference
 from pgdm.sim.batch import SimState
 from pgdm.sim.scene import SceneIndex
 
 Observe = Callable[[SimState, Tensor], Tensor]
-"""State of n simulations and steps since reset (n,) -> observations (n, D) float32."""
+"""State of n simulations, steps since reset (n,) -> observations (n, D) float32."""
 
 
 @dataclass(frozen=True)
 class ObsCfg:
-    """Which observation the policy gets."""
+    """What the policy observes."""
 
     layout: str
-    """``released``: as the authors' code; ``paper``: as the text, without velocities and goals."""
+    """``released``: as in the released code; ``paper``: as in the paper, no velocities or later
+    targets."""
 
 
 def released(index: SceneIndex, reference: ObjectReference) -> Observe:
-    """Return the released layout, 322 numbers for Adroit with a six-joint object (R).
+    """Return the released code's layout; D = 322 for Adroit and an object with six joints.
 
-    qpos | positions of points and object | their quaternions | qvel | linear and angular
-    velocity of each point, then of the object | goals 1, 5, 10 steps ahead | time encoding.
+    qpos (nq) | positions of the P points, then of the object's centre of mass, 3 each | their
+    quaternions, wxyz, 4 each | qvel (nv) | linear, then angular velocity of each point, then of the
+    object, 6 each | targets ahead (21, `ObjectReference.ahead`) | time encoding (8). World frame;
+    m, rad, s.
     """
-    ahead = torch.cat((reference.goals(), reference.time_encoding()), -1)
+    ahead = torch.cat((reference.ahead(), reference.time_encoding()), -1)
 
     def observe(s: SimState, t: Tensor) -> Tensor:
         parts = (
@@ -51,15 +54,16 @@ def released(index: SceneIndex, reference: ObjectReference) -> Observe:
 
 
 def paper(index: SceneIndex, reference: ObjectReference) -> Observe:
-    """Return the paper's layout (P III-B).
+    """Return the paper's layout (App. B).
 
-    Robot joints (nu) | fingertip positions | object position and quaternion | time encoding.
+    Hand joints (n) | fingertip positions, 3 each | the object's position (3) and quaternion (4) |
+    time encoding (8). World frame; m, rad.
     """
     time = reference.time_encoding()
     tips = torch.from_numpy(index.fingertips)
 
     def observe(s: SimState, t: Tensor) -> Tensor:
-        joints = s.qpos[:, : index.num_actuators]
+        joints = s.qpos[:, : index.num_joints]
         fingertips = s.point_pos[:, tips].flatten(1)
         return torch.cat((joints, fingertips, s.object_pos, s.object_quat, time[t]), -1).float()
 
@@ -78,6 +82,5 @@ def layout(cfg: ObsCfg, index: SceneIndex, reference: ObjectReference) -> Observ
     Raises:
         UnknownNameError: if there is no such layout.
     """
-    if cfg.layout not in LAYOUTS:
-        raise UnknownNameError("observation layout", cfg.layout, LAYOUTS)
+    check_name("observation layout", cfg.layout, LAYOUTS)
     return LAYOUTS[cfg.layout](index, reference)

@@ -1,18 +1,22 @@
-"""A Recipe is the named, weighted list of an MDP's terms."""
+"""The recipe of an MDP: its named, weighted terms."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from numbers import Real
 
+import torch
 from torch import Tensor
 
 from pgdm.errors import ConfigError
 from pgdm.mdp.context import StepContext
 from pgdm.mdp.metrics import MetricsCfg
+from pgdm.paths import check_path_part
 
 _NEVER = 10**15
-"""Frames by which any schedule has come to its end."""
+"""Environment steps after which every schedule has reached its final weight."""
 _TRAINING_ONLY = ", training only"
 
 
@@ -24,7 +28,7 @@ class RewardTerm:
     weight: float
     value: Callable[[StepContext], Tensor]  # -> (n,) before weighting
     shaping: bool = False
-    """Whether it is paid in trainings only, and no part of the task's own return."""
+    """Whether it is used in training only and is not part of the task's own return."""
 
 
 @dataclass(frozen=True)
@@ -37,74 +41,99 @@ class EndTerm:
 
 @dataclass(frozen=True)
 class Measure:
-    """Something that is recorded of every step, and acts on nothing."""
+    """A quantity that is recorded at every step and has no effect on training."""
 
     name: str
-    value: Callable[[StepContext], Tensor]  # -> (n,), NaN where it does not apply
+    value: Callable[[StepContext], Tensor]  # -> (n,), NaN where not applicable
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Everything about an MDP that a method may choose."""
+    """Everything that a method may choose in an MDP."""
 
     rewards: tuple[RewardTerm, ...]
     ends: tuple[EndTerm, ...]
     metrics: MetricsCfg
     schedules: tuple[Callable[[int], dict[str, float]], ...] = ()
-    """From environment steps so far to reward weights by term name, asked before each iteration."""
+    """Maps environment steps so far to reward weights by term name; called once per iteration."""
 
     measures: tuple[Measure, ...] = ()
-    """Recorded for each episode as the mean over its steps, under their names."""
+    """Recorded under their names, averaged over the steps of an episode."""
     discount: Callable[[StepContext], Tensor] | None = None
-    """By how much the future counts less after a step, (n,) in [0, 1]; trainings only."""
+    """Extra discount of the rewards after a step, (n,) in [0, 1]; in training only."""
     needs_expert: bool = False
-    """Whether terms or measures compare with an expert's hand trajectory."""
+    """Whether terms or measures compare the hand with an expert's."""
 
     def __post_init__(self) -> None:
-        """Check that terms can be told apart by their names.
+        """Check that the terms are of their kind, with valid and distinct names and real weights.
 
         Raises:
-            ConfigError: if not.
+            ConfigError: at the first one that is not.
         """
-        for terms in (self.rewards, self.ends, self.measures):
+        if not self.rewards or not self.ends:
+            raise ConfigError("a recipe needs a reward and a termination at least")
+        for kind, terms in (
+            (RewardTerm, self.rewards),
+            (EndTerm, self.ends),
+            (Measure, self.measures),
+        ):
+            for term in terms:
+                if not isinstance(term, kind):
+                    raise ConfigError(f"a recipe has {term!r} where a {kind.__name__} is needed")
             names = [term.name for term in terms]
+            for name in names:  # MLflow would refuse others, after hours of training
+                check_path_part(f"name of a {kind.__name__}", name)
             twice = next((name for name in names if names.count(name) > 1), None)
             if twice is not None:
                 raise ConfigError(
-                    f"a recipe has the {type(terms[0]).__name__} '{twice}' twice; give each its "
-                    "own name: under it, it is recorded"
+                    f"a recipe has the {kind.__name__} '{twice}' twice; names must be "
+                    "distinct, as terms are recorded under them"
+                )
+        for reward in self.rewards:
+            if not isinstance(reward.weight, Real) or not math.isfinite(reward.weight):
+                raise ConfigError(
+                    f"the weight of the reward '{reward.name}' is {reward.weight!r}; it must be a "
+                    "finite number"
                 )
 
     def comparing(self, measures: tuple[Measure, ...]) -> Recipe:
-        """Return it with measures that compare with an expert, beside those it has."""
+        """Return the recipe with additional measures that compare the hand with an expert's."""
         new = tuple(measure for measure in measures if measure not in self.measures)
         return replace(self, measures=(*self.measures, *new), needs_expert=True)
 
     def check(self, context: StepContext) -> None:
-        """Check that every term gives one value a simulation.
+        """Check that every term returns one value per simulation, terminations True or False.
 
         Raises:
             ConfigError: at the first one that does not.
         """
-        values = {f"reward '{term.name}'": term.value(context) for term in self.rewards}
-        values |= {f"end '{end.name}'": end.reached(context) for end in self.ends}
-        values |= {f"measure '{m.name}'": m.value(context) for m in self.measures}
-        if self.discount is not None:
-            values["discount"] = self.discount(context)
-        for name, value in values.items():
-            if value.shape != context.t.shape:
+        terms: dict[str, Callable[[StepContext], Tensor]] = {
+            **{f"reward '{term.name}'": term.value for term in self.rewards},
+            **{f"termination '{end.name}'": end.reached for end in self.ends},
+            **{f"measure '{m.name}'": m.value for m in self.measures},
+            **({} if self.discount is None else {"discount": self.discount}),
+        }
+        for name, term in terms.items():
+            value = _called(name, term, context)
+            found = getattr(value, "shape", type(value).__name__)
+            if not isinstance(value, Tensor) or found != context.t.shape:
+                found = f"a {found}" if isinstance(found, str) else f"shape {tuple(found)}"
                 raise ConfigError(
-                    f"the {name} of this method gives values of shape {tuple(value.shape)}; it "
-                    f"must be one a simulation, {tuple(context.t.shape)}"
+                    f"the {name} of this method returns {found}; it must be a tensor of one value "
+                    f"per simulation, {tuple(context.t.shape)}"
+                )
+            if name.startswith("termination") and value.dtype != torch.bool:
+                raise ConfigError(
+                    f"the {name} of this method returns {value.dtype}; it must be torch.bool"
                 )
 
     def unfinished(self, frames: int) -> list[tuple[str, float, float]]:
-        """Return (name, weight, final weight) of rewards whose schedule outlasts so many frames."""
+        """Return (name, weight, final weight) of rewards whose schedule outlasts ``frames``."""
         last, final = self._scheduled(frames), self._scheduled(_NEVER)
         return [(name, last[name], w) for name, w in final.items() if last[name] != w]
 
     def table(self) -> list[tuple[str, str, str]]:
-        """Return what is active as rows (kind, name, weight), for people to read."""
+        """Return the active terms as rows of text: kind, name, weight."""
         first = self._scheduled(0)
         rows = [
             (
@@ -116,11 +145,22 @@ class Recipe:
         ]
         if self.discount is not None:
             rows.append((f"discount{_TRAINING_ONLY}", "", ""))
-        rows += [("end", end.name, "") for end in self.ends]
+        rows += [("termination", end.name, "") for end in self.ends]
         return rows + [("measure", measure.name, "") for measure in self.measures]
 
     def _scheduled(self, frames: int) -> dict[str, float]:
         return {name: w for schedule in self.schedules for name, w in schedule(frames).items()}
+
+
+def _called(name: str, term: Callable[[StepContext], Tensor], context: StepContext) -> Tensor:
+    try:
+        return term(context)
+    except TypeError as error:
+        if error.__traceback__ is not None and error.__traceback__.tb_next is not None:
+            raise  # from inside of the term
+        raise ConfigError(
+            f"the {name} of this method cannot be called with a StepContext alone: {error}"
+        ) from error
 
 
 def _weight(weight: float, first: float | None) -> str:

@@ -1,4 +1,12 @@
-"""Reward terms before weighting: one value a simulation (SPEC 1, Reward and end)."""
+"""Reward terms before weighting, one value per simulation.
+
+With the term weights, a step's reward is (released code; paper, Sec. III-A)
+
+    lambda_1 exp(-alpha (e + c phi/pi)) + lambda_2 [object and target lifted] + ...
+
+where e is the distance of the object's centre of mass from its target [m] and phi the angle
+between object and target [rad].
+"""
 
 from __future__ import annotations
 
@@ -12,35 +20,39 @@ from pgdm.mdp.context import StepContext
 
 @dataclass(frozen=True)
 class RewardCfg:
-    """Weights and scales of the object reward (R; P writes alpha=50, beta=5)."""
+    """Weights and scales of the object reward.
+
+    The paper writes alpha e + beta phi with alpha = 50, beta = 5 (App. B); in the released code
+    phi is divided by pi first, so that c = beta / alpha = 0.1 m.
+    """
 
     tracking_weight: float
     """lambda_1, weight of the tracking term."""
     tracking_scale: float
-    """alpha, how fast the tracking term falls with distance, 1/m."""
+    """alpha, decay rate of the tracking term with distance, 1/m."""
     orientation_scale: float
-    """Metres that count as much as half a turn: the angle is divided by pi first."""
+    """c, distance that costs as much as an angle of pi, m."""
     lift_weight: float
-    """Weight of the lift bonus."""
+    """lambda_2, weight of the lift bonus."""
     lift_height_m: float
     """Height above the start at which object and target count as lifted, m."""
 
 
 def tracking(c: StepContext, scale: float, orientation_scale: float) -> Tensor:
-    """Return exp(-scale (e + orientation_scale angle/pi)), (n,) in (0, 1]."""
+    """Return exp(-scale (e + orientation_scale phi/pi)), (n,) in (0, 1]."""
     return torch.exp(-scale * (c.object_error + orientation_scale / torch.pi * c.object_angle))
 
 
 def lift(c: StepContext, height_m: float) -> Tensor:
-    """Return 1 where object and target are both ``height_m`` above the start, (n,)."""
+    """Return 1 where object and target are both ``height_m`` above the object's start, (n,)."""
     lower = torch.minimum(c.target_pos[:, 2], c.state.object_pos[:, 2])
     return (lower >= c.start_height + height_m).double()
 
 
 def hand_imitation(c: StepContext, space: str, form: str, scale: float) -> Tensor:
-    """Return exp(-scale d), (n,) in (0, 1], d the hand's distance from the expert's.
+    """Return exp(-scale d), (n,) in (0, 1], with the hand error d (DeepMimic; paper, App. D).
 
-    ``space`` and ``form`` are those of `StepContext.hand_error`.
+    ``space`` and ``form`` choose d, see `StepContext.hand_error`.
     """
     return torch.exp(-scale * c.hand_error(space, form))
 
@@ -48,12 +60,12 @@ def hand_imitation(c: StepContext, space: str, form: str, scale: float) -> Tenso
 def fingertip_contact(c: StepContext, form: str, scale: float) -> Tensor:
     """Return the mean of exp(-scale d) over the fingers in contact, (n,) in [0, 1].
 
-    d is a fingertip's distance from the expert's contact point, |d| or |d|^2. Where the expert
-    touches nothing, nothing is asked, and the term is 0: which steps these are depends on the
-    time alone, so the order of policies whose episodes are equally long is that of any other
-    constant, and what is logged is of contact only.
+    GRAFF* (paper, App. D): d is the distance of a fingertip from the expert's contact point, |d|
+    [m] or |d|^2 [m^2]. The term is 0 at steps where the expert touches nothing. These steps depend
+    on time alone, so any constant would rank policies with equally long episodes the same, and
+    with 0 the logged term reflects contact only.
     """
     d = c.contact_distance
     value = torch.exp(-scale * (d.square() if form == "squared" else d))
-    asked = c.in_contact
-    return torch.where(asked, value, 0.0).sum(1) / asked.sum(1).clamp(min=1)
+    wanted = c.in_contact
+    return torch.where(wanted, value, 0.0).sum(1) / wanted.sum(1).clamp(min=1)

@@ -7,19 +7,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Ramp:
-    """A reward term's weight that grows linearly from 0.
+    """A reward weight that grows linearly: weight * min(1, steps so far / frames).
 
-    It depends on the frames alone, so a training that was resumed, or that has another number of
-    simulations, has the same weights at the same frames.
+    It depends on the environment steps alone, so a resumed training, or one with another number of
+    simulations, has the same weight after the same number of steps.
     """
 
     term: str
-    """The term."""
+    """Name of the reward term."""
     weight: float
-    """Its weight from then on."""
+    """Final weight."""
     frames: int
-    """Environment steps, over all simulations, until then."""
+    """Length of the ramp, environment steps over all simulations."""
 
     def __call__(self, frames: int) -> dict[str, float]:
-        """Return the weight after so many environment steps, by the term's name."""
+        """Return the weight after ``frames`` environment steps, by the term's name."""
         return {self.term: self.weight * min(1.0, frames / self.frames)}

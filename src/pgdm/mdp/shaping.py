@@ -1,7 +1,12 @@
-"""What a training may add to a task's own reward and ends; evaluations never see it.
+"""Shaping: what training may add to a task's own reward and terminations; evaluation never does.
 
-The paper's reward is flat far from the target: exp(-50 e) is 0.05 at 6 cm, and the lift bonus is
-paid at any distance. These additions give the learner a slope to follow, the same for all tasks.
+The paper's reward is flat far from the target: exp(-50 e) is 0.05 at e = 6 cm, and the lift bonus
+does not depend on e. With the object error e [m], pgdm replaces reward and
+discount factor gamma by
+
+    reward + kernel_weight exp(-kernel_scale e)    and    gamma exp(-(e / soft_end_m)^2)
+
+the same for all tasks.
 """
 
 from __future__ import annotations
@@ -11,29 +16,29 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pgdm.errors import ConfigError
+from pgdm.errors import check_above_zero, check_at_least
 from pgdm.mdp.context import StepContext
 from pgdm.mdp.recipe import Recipe, RewardTerm
 
 SLOPE = "slope"
-"""Name of the added reward term."""
+"""Recorded name of the wide tracking term, which is added to the reward."""
 
 
 @dataclass(frozen=True)
 class ShapingCfg:
-    """What is added."""
+    """Settings of the additions."""
 
     name: str
-    """Name of the settings, as reports show it."""
+    """Name of these settings in reports."""
     kernel_weight: float
-    """Weight of a second tracking term exp(-kernel_scale e); 0: none."""
+    """Weight of the wide tracking term; 0: none."""
     kernel_scale: float
-    """How fast that term falls with the object's distance e, 1/m."""
+    """Decay rate of that term, 1/m."""
     soft_end_m: float | None
-    """Distance at which the future is discounted by a further 1/e, m; None: not at all."""
+    """Scale of the extra discount, m; None: none."""
 
     def described(self) -> str:
-        """Return what it does in a sentence, or nothing."""
+        """Return the additions as a phrase, empty if there are none."""
         parts = []
         if self.kernel_weight:
             width_m = 1 / self.kernel_scale
@@ -41,24 +46,22 @@ class ShapingCfg:
         if self.soft_end_m is not None:
             parts.append(f"future rewards are scaled by exp(-(e/{self.soft_end_m:g} m)^2)")
         what = " and ".join(parts)
-        return f"with the object at distance e from its target, {what}" if parts else ""
+        return f"with the object error e, {what}" if parts else ""
 
     def validate(self) -> None:
         """Check the numbers.
 
         Raises:
-            ConfigError: at the first one that cannot be right.
+            ConfigError: at the first invalid one.
         """
-        if (weight := self.kernel_weight) < 0:
-            raise ConfigError(f"shaping.kernel_weight is {weight}; it must be at least 0")
-        for key in ("kernel_scale", "soft_end_m"):
-            value = getattr(self, key)
-            if value is not None and value <= 0:
-                raise ConfigError(f"shaping.{key} is {value}; it must be above 0")
+        check_at_least("shaping.kernel_weight", self.kernel_weight, 0)
+        check_above_zero("shaping.kernel_scale", self.kernel_scale)
+        if self.soft_end_m is not None:
+            check_above_zero("shaping.soft_end_m", self.soft_end_m)
 
 
 def shaped(recipe: Recipe, cfg: ShapingCfg) -> Recipe:
-    """Return a recipe with the additions."""
+    """Return the recipe with the additions."""
     if cfg.kernel_weight:
         scale = cfg.kernel_scale
 

@@ -1,4 +1,8 @@
-"""Ends of an episode (SPEC 1, Reward and end): one flag a simulation."""
+"""Terminations: reasons for an episode to terminate, one flag per simulation.
+
+All are true terminal states: nothing is bootstrapped after them. Truncation (a diverged
+simulation) is decided elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -11,26 +15,32 @@ from pgdm.mdp.context import StepContext
 
 @dataclass(frozen=True)
 class TerminationCfg:
-    """When an episode ends early."""
+    """When an episode terminates early."""
 
     max_object_error_m: float
-    """Distance of the object from its target at which the episode ends, m."""
+    """Distance of the object from its target at which the episode terminates, m."""
 
 
 def object_lost(c: StepContext, max_error_m: float) -> Tensor:
-    """Return whether the object is ``max_error_m`` or more away from its target, (n,) bool."""
+    """Return e >= max_error_m, (n,) bool, with the object error e [m].
+
+    Released code; the paper (Sec. III-A) terminates at e > omega.
+    """
     return c.object_error >= max_error_m
 
 
 def motion_ended(c: StepContext) -> Tensor:
-    """Return whether the motion is over, (n,) bool: a true terminal in R, nothing follows it."""
+    """Return t >= T-1, (n,) bool: the last pose of the motion was reached.
+
+    Terminal in the released code; time is part of the observation.
+    """
     return c.t >= c.last_t
 
 
 def hand_lost(c: StepContext, space: str, form: str, max_error: float, grace_steps: int) -> Tensor:
-    """Return whether the hand is further than ``max_error`` from the expert's, (n,) bool.
+    """Return d > max_error, (n,) bool, with the hand error d (DeepMimic; paper, App. D).
 
-    Never in the first ``grace_steps`` steps: some stored pre-grasps begin beyond the limit.
-    ``space`` and ``form`` are those of `StepContext.hand_error`.
+    False in the first ``grace_steps`` steps: some mined pre-grasps start beyond it.
+    ``space`` and ``form`` choose d, see `StepContext.hand_error`.
     """
     return (c.t > grace_steps) & (c.hand_error(space, form) > max_error)

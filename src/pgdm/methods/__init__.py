@@ -1,7 +1,8 @@
-"""Methods: each turns its settings into a Recipe. One row each; users' own ones need none."""
+"""Methods: each turns its settings into a recipe. Users' own methods need no row here."""
 
 from __future__ import annotations
 
+from pgdm.errors import ConfigError
 from pgdm.mdp.recipe import Recipe
 from pgdm.methods import curriculum, deepmimic, full, graff, pgdm
 from pgdm.methods.method import Method, find
@@ -29,9 +30,21 @@ def recipe(cfg: MethodCfg) -> Recipe:
     """Return the configured method's Recipe.
 
     Raises:
-        ConfigError: if there is no such method.
+        ConfigError: if there is no such method, or it ends Python or returns something else.
     """
-    return find(cfg.name, METHODS).recipe(cfg)
+    try:
+        made = find(cfg.name, METHODS).recipe(cfg)
+    except SystemExit as error:
+        raise ConfigError(
+            f"method.name '{cfg.name}': its recipe function ends Python (exit code {error.code}); "
+            "it must not"
+        ) from error
+    if not isinstance(made, Recipe):
+        raise ConfigError(
+            f"method.name '{cfg.name}': its recipe function returns {made!r:.60}; it must return a "
+            "pgdm.mdp.recipe.Recipe"
+        )
+    return made
 
 
 __all__ = ["METHODS", "Method", "MethodCfg", "config_class", "recipe"]

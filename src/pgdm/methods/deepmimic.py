@@ -1,70 +1,63 @@
-"""DeepMimic: PGDM's terms, and the hand follows an expert's (P App. Baselines, SPEC 3)."""
+"""DeepMimic: PGDM's terms plus imitation of an expert's hand (paper, App. D).
+
+Adds lambda_3 exp(-eta d) to the reward and terminates at d > gamma_h, with the hand error d.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
 
-from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.errors import check_above_zero, check_at_least, check_name
 from pgdm.mdp import rewards, terminations
 from pgdm.mdp.context import FORMS, SPACES
 from pgdm.mdp.measures import HAND_MEASURES
 from pgdm.mdp.recipe import EndTerm, Recipe, RewardTerm
 from pgdm.methods import pgdm
-from pgdm.methods.pgdm import MethodCfg, check_above_zero
+from pgdm.methods.pgdm import MethodCfg
 
 
 @dataclass(frozen=True)
 class ImitationCfg:
-    """How the hand's distance from the expert's is paid for, and when it ends an episode."""
+    """How the hand error is rewarded, and when it terminates an episode."""
 
     space: str
-    """What is compared: ``fingertips``, positions, m; ``joints``, all of the hand's, m and rad."""
+    """h: ``fingertips`` (positions, m) or ``joints`` (all of the hand's, m and rad)."""
     form: str
-    """``squared``: |h - hhat|^2 (published appendix); ``norm``: |h - hhat| (earlier text)."""
+    """d: ``squared``, |h - h_expert|^2 (published appendix); ``norm``, its root (earlier text)."""
     weight: float
     """lambda_3, weight of the term."""
     scale: float
-    """eta, how fast the term falls with the distance in its form."""
+    """eta, decay rate of the term with d."""
     max_hand_error: float | None
-    """gamma_h, distance, in its form, beyond which an episode ends; None: it never does."""
+    """gamma_h, d beyond which an episode terminates; None: never."""
     grace_steps: int
-    """Steps since reset in which that distance is not checked yet."""
+    """Control steps after reset in which d terminates no episode."""
 
     def validate(self) -> None:
         """Check names and numbers.
 
         Raises:
-            ConfigError: at the first one that cannot be right.
+            ConfigError: at the first invalid one.
         """
-        if self.space not in SPACES:
-            raise UnknownNameError("method.imitation.space value", self.space, SPACES)
-        if self.form not in FORMS:
-            raise UnknownNameError("method.imitation.form value", self.form, FORMS)
+        check_name("method.imitation.space value", self.space, SPACES)
+        check_name("method.imitation.form value", self.form, FORMS)
         check_above_zero("method.imitation.scale", self.scale)
         if self.max_hand_error is not None:
             check_above_zero("method.imitation.max_hand_error", self.max_hand_error)
-        if self.grace_steps < 0:
-            raise ConfigError(
-                f"method.imitation.grace_steps is {self.grace_steps}; it must be at least 0"
-            )
+        check_at_least("method.imitation.grace_steps", self.grace_steps, 0)
 
 
 @dataclass(frozen=True)
 class DeepMimicCfg(MethodCfg):
-    """PGDM's settings and those of imitation."""
+    """Settings of PGDM and of imitation."""
 
     imitation: ImitationCfg
-    """The hand's part."""
-
-    def validate(self) -> None:
-        """Check the numbers; see ``MethodCfg``."""
-        super().validate()
-        self.imitation.validate()
+    """Imitation of the hand."""
 
 
 def add_imitation(base: Recipe, cfg: ImitationCfg) -> Recipe:
-    """Return a recipe with the imitation reward and, if there is a limit, its end."""
+    """Return the recipe with the imitation reward and, if there is a limit, its termination."""
     close = partial(rewards.hand_imitation, space=cfg.space, form=cfg.form, scale=cfg.scale)
     ends = base.ends
     if cfg.max_hand_error is not None:

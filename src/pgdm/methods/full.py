@@ -1,4 +1,4 @@
-"""Any combination of the methods: a section of the settings that is null is left out."""
+"""Any combination of the methods: sections of the settings that are null are left out."""
 
 from __future__ import annotations
 
@@ -14,30 +14,23 @@ from pgdm.methods.pgdm import MethodCfg
 
 @dataclass(frozen=True)
 class FullCfg(MethodCfg):
-    """PGDM's settings and those of every addition."""
+    """Settings of PGDM and of every addition."""
 
     imitation: ImitationCfg | None
-    """DeepMimic's part, or None."""
+    """As in DeepMimic, or None."""
     contact: ContactCfg | None
-    """GRAFF*'s part, or None."""
+    """As in GRAFF*, or None."""
     curriculum: RampCfg | None
-    """The curriculum's part, or None."""
-
-    def validate(self) -> None:
-        """Check the numbers; see ``MethodCfg``."""
-        super().validate()
-        for part in (self.imitation, self.contact, self.curriculum):
-            if part is not None:
-                part.validate()
+    """As in the task curriculum, or None."""
 
 
 def recipe(cfg: FullCfg) -> Recipe:
-    """Return PGDM's terms and those of the sections that are there."""
-    made = pgdm.recipe(cfg)
+    """Return PGDM's terms and those of the sections that are not None."""
+    combined = pgdm.recipe(cfg)
     if cfg.imitation is not None:
-        made = add_imitation(made, cfg.imitation)
+        combined = add_imitation(combined, cfg.imitation)
     if cfg.contact is not None:
-        made = add_contact(made, cfg.contact)
+        combined = add_contact(combined, cfg.contact)
     if cfg.curriculum is not None:
-        made = add_curriculum(made, cfg.curriculum)
-    return made
+        combined = add_curriculum(combined, cfg.curriculum)
+    return combined

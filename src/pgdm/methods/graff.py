@@ -1,61 +1,59 @@
-"""GRAFF*: PGDM's terms, and fingertips at the expert's contact points (P App., SPEC 3)."""
+"""GRAFF*: PGDM's terms plus a reward for fingertips at the expert's contacts (paper, App. D).
+
+Adds lambda times the mean of exp(-eta d) over the fingers in contact to the reward, with the
+distance d of a fingertip f from the expert's contact point c on the object.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
 
-from pgdm.errors import UnknownNameError
+from pgdm.errors import check_above_zero, check_name
 from pgdm.mdp import rewards
 from pgdm.mdp.context import FORMS
 from pgdm.mdp.measures import HAND_MEASURES
 from pgdm.mdp.recipe import Recipe, RewardTerm
 from pgdm.methods import pgdm
-from pgdm.methods.pgdm import MethodCfg, check_above_zero
+from pgdm.methods.pgdm import MethodCfg
 
 
 @dataclass(frozen=True)
 class ContactCfg:
-    """How fingertips are paid for being where the expert's fingers touch the object."""
+    """How fingertips at the expert's contact points are rewarded."""
 
     form: str
-    """``squared``: |c - f|^2 (published appendix); ``norm``: |c - f| (earlier text)."""
+    """d: ``squared``, |c - f|^2 (published appendix); ``norm``, |c - f| (earlier version)."""
     weight: float
     """lambda, weight of the term."""
     scale: float
-    """eta, how fast the term falls with the distance in its form, 1/m^2 or 1/m."""
+    """eta, decay rate of the term with d, 1/m^2 or 1/m."""
 
     def validate(self) -> None:
         """Check names and numbers.
 
         Raises:
-            ConfigError: at the first one that cannot be right.
+            ConfigError: at the first invalid one.
         """
-        if self.form not in FORMS:
-            raise UnknownNameError("method.contact.form value", self.form, FORMS)
+        check_name("method.contact.form value", self.form, FORMS)
         check_above_zero("method.contact.scale", self.scale)
 
 
 @dataclass(frozen=True)
 class GraffCfg(MethodCfg):
-    """PGDM's settings and those of contact."""
+    """Settings of PGDM and of contact."""
 
     contact: ContactCfg
-    """The fingertips' part."""
-
-    def validate(self) -> None:
-        """Check the numbers; see ``MethodCfg``."""
-        super().validate()
-        self.contact.validate()
+    """Contact of the fingertips."""
 
 
 def add_contact(base: Recipe, cfg: ContactCfg) -> Recipe:
-    """Return a recipe with the contact reward."""
+    """Return the recipe with the contact reward."""
     near = partial(rewards.fingertip_contact, form=cfg.form, scale=cfg.scale)
     term = RewardTerm("contact", cfg.weight, near)
     return replace(base, rewards=(*base.rewards, term)).comparing(HAND_MEASURES)
 
 
 def recipe(cfg: GraffCfg) -> Recipe:
-    """Return PGDM's terms and that of contact."""
+    """Return PGDM's terms and the contact reward."""
     return add_contact(pgdm.recipe(cfg), cfg.contact)

@@ -1,4 +1,4 @@
-"""What a method is, and how one is found by its name."""
+"""What a method is, and how it is found by name."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from pgdm.methods.pgdm import MethodCfg
 
 @dataclass(frozen=True)
 class Method:
-    """A way of making an MDP: the class of its settings, and what it makes of them."""
+    """A method: the class of its settings and the function that turns them into a recipe."""
 
     config: type[MethodCfg]
     """Frozen dataclass of the group ``method``; it has at least the keys of ``MethodCfg``."""
     recipe: Callable[[Any], Recipe]
-    """From an instance of ``config`` to the terms."""
+    """Turns an instance of ``config`` into its recipe."""
 
 
 def find(name: str, methods: Mapping[str, Method]) -> Method:
-    """Return a method by its name, or by the place of a user's own one.
+    """Return a method by its name or, for a user's own method, by its location.
 
     Args:
         name: a key of ``methods``, or ``my_package.module:attribute``, which is imported.
-        methods: those that have a name.
+        methods: the named methods.
 
     Raises:
         UnknownNameError: if there is no method of that name.
-        ConfigError: if there is no such module, or no `Method` in it.
+        ConfigError: if the module does not exist, is no valid Python or has no such `Method`.
     """
     if ":" in name:
         return _imported(name)
     if name not in methods:
-        hint = "A method of your own is written as my_package.module:attribute"
+        hint = "Your own method is given as my_package.module:attribute"
         raise UnknownNameError("method.name value", name, methods, hint)
     return methods[name]
 
@@ -50,12 +50,20 @@ def _imported(name: str) -> Method:
     except ImportError as error:
         found = error.name is None or not f"{module_name}.".startswith(f"{error.name}.")
         cure = (
-            "mend it: the module is there, but not all that it imports"
+            "the module exists, but something it imports does not: correct it"
             if found
-            else "install its package, or name the folder it lies in with PYTHONPATH"
+            else "install its package, or add its folder to PYTHONPATH"
         )
         raise ConfigError(
             f"method.name '{name}': cannot import '{module_name}' ({error}); {cure}"
+        ) from error
+    except SyntaxError as error:
+        place = f"{error.filename}, line {error.lineno}" if error.filename else module_name
+        raise ConfigError(f"method.name '{name}': {place}: {error.msg}") from error
+    except SystemExit as error:
+        raise ConfigError(
+            f"method.name '{name}': importing '{module_name}' ends Python (exit code "
+            f"{error.code}); a module with a method must not"
         ) from error
     found = getattr(module, attribute, None)
     if not isinstance(found, Method):
@@ -63,5 +71,10 @@ def _imported(name: str) -> Method:
         raise ConfigError(
             f"method.name '{name}': '{attribute}' of {module.__file__} is not a "
             f"pgdm.methods.Method; it has: {', '.join(there) or 'none'}"
+        )
+    if not (isinstance(found.config, type) and issubclass(found.config, MethodCfg)):
+        raise ConfigError(
+            f"method.name '{name}': config of the Method is {found.config!r}; it must be a frozen "
+            "dataclass derived from pgdm.methods.MethodCfg"
         )
     return found

@@ -1,11 +1,11 @@
-"""PGDM: the object reward alone, from a pre-grasp (P III-B, SPEC 1 and 2)."""
+"""PGDM: the object reward alone, from a pre-grasp (paper, Sec. III)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
 
-from pgdm.errors import ConfigError
+from pgdm.errors import check_above_zero
 from pgdm.mdp import rewards, terminations
 from pgdm.mdp.metrics import MetricsCfg
 from pgdm.mdp.recipe import EndTerm, Recipe, RewardTerm
@@ -15,41 +15,34 @@ from pgdm.mdp.terminations import TerminationCfg
 
 @dataclass(frozen=True)
 class MethodCfg:
-    """What every method has: its name, and the numbers of PGDM's terms, on which it builds."""
+    """Settings of every method: its name, and PGDM's terms, which it builds on."""
 
     name: str
-    """Which method; a row of ``pgdm.methods.METHODS``, or ``my_package.module:attribute``."""
+    """Key of ``pgdm.methods.METHODS``, or ``my_package.module:attribute``."""
     reward: RewardCfg
     """Object reward."""
     termination: TerminationCfg
-    """Early ends."""
+    """Early termination."""
     success_threshold_m: float
-    """Distance at which a step counts as a success in the metrics, m."""
+    """Largest distance from the target at which a step counts as a success, m."""
 
     def validate(self) -> None:
-        """Check the numbers.
+        """Check the numbers, then each section that has a ``validate`` of its own.
 
         Raises:
-            ConfigError: at the first one that cannot be right.
+            ConfigError: at the first invalid one.
         """
         check_above_zero("method.reward.tracking_scale", self.reward.tracking_scale)
         limit = self.termination.max_object_error_m
         check_above_zero("method.termination.max_object_error_m", limit)
         check_above_zero("method.success_threshold_m", self.success_threshold_m)
-
-
-def check_above_zero(key: str, value: float) -> None:
-    """Check a number of the settings.
-
-    Raises:
-        ConfigError: if it is 0 or less.
-    """
-    if value <= 0:
-        raise ConfigError(f"{key} is {value}; it must be above 0")
+        for section in vars(self).values():
+            if hasattr(section, "validate"):
+                section.validate()
 
 
 def recipe(cfg: MethodCfg) -> Recipe:
-    """Return PGDM's terms: tracking, lift bonus, object lost, motion ended."""
+    """Return PGDM's terms: tracking and lift bonus; object lost and motion ended."""
     r = cfg.reward
     track = partial(rewards.tracking, scale=r.tracking_scale, orientation_scale=r.orientation_scale)
     lift = partial(rewards.lift, height_m=r.lift_height_m)

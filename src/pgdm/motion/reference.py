@@ -1,4 +1,4 @@
-"""The exemplar object trajectory and the expert's: immutable; index in, target out."""
+"""The exemplar motion of the object, and the expert's motion of the hand: immutable, by step."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from torch import Tensor
 from pgdm import rotations
 from pgdm.library import Expert, Motion
 
-# Steps ahead whose targets the agent sees (R, reference motion goals).
-GOAL_STEPS = (1, 5, 10)
-# Frequencies of the positional encoding of time (R).
+# Control steps ahead whose targets are observed (released code).
+STEPS_AHEAD = (1, 5, 10)
+# Frequencies of the encoding of time (released code).
 TIME_FREQUENCIES = (1, 4, 6, 8)
 
 
 @dataclass(frozen=True)
 class ReferenceCfg:
-    """How the stored poses become targets."""
+    """How stored poses become targets."""
 
     frame: str
-    """``released``: the stored position is the centre of mass's target, as published;
-    ``com_corrected``: it is that of the mesh's origin, as recorded, and the target is where the
-    centre of mass then lies."""
+    """``released``: the stored position is the target of the centre of mass, as published;
+    ``com_corrected``: it is the position of the mesh's origin, as recorded, and the target is the
+    centre of mass of the object there."""
 
 
 FRAMES = ("released", "com_corrected")
@@ -31,20 +31,22 @@ FRAMES = ("released", "com_corrected")
 
 @dataclass(frozen=True)
 class ObjectReference:
-    """Trajectory X = [x_0..x_{T-1}] of the followed object, world frame, float64 (SPEC 1)."""
+    """The exemplar motion x_0..x_{T-1} of the tracked object, world frame, float64."""
 
     pos: Tensor
-    """(T, 3) m, compared with the object body's centre of mass."""
+    """(T, 3) m, targets of the object's centre of mass."""
     quat: Tensor
-    """(T, 4) unit, wxyz, compared with the object body's orientation."""
+    """(T, 4) unit quaternions, wxyz, targets of the object body's orientation."""
 
     @classmethod
     def of(cls, motion: Motion) -> ObjectReference:
-        """Take the trajectory of a stored motion."""
+        """Return a stored motion as a reference, targets as published."""
         return cls(torch.as_tensor(motion.translation), torch.as_tensor(motion.orientation))
 
     def com_corrected(self, com: Tensor) -> ObjectReference:
-        """Return targets of the centre of mass for poses that are those of the body's origin.
+        """Return targets of the centre of mass, taking the poses as those of the body's origin.
+
+        x_t + R(x_t) com, with the orientation unchanged.
 
         Args:
             com: (3,) m, the centre of mass in the body's frame.
@@ -56,34 +58,33 @@ class ObjectReference:
         """Return T, the number of poses; an episode has at most T-1 steps."""
         return self.pos.shape[0]
 
-    def goals(self) -> Tensor:
-        """Return what the agent sees of the targets ahead at every step, (T, 21).
+    def ahead(self) -> Tensor:
+        """Return the observed future targets at every step t, (T, 21) (released code).
 
-        For each of ``GOAL_STEPS``: orientation (4), then translation (3), at the end of the
-        motion those of its last pose (R).
+        For each k of ``STEPS_AHEAD``: orientation (4), then position (3) of x_{min(t+k, T-1)}.
         """
-        now = torch.arange(len(self))
-        ahead = [(now + k).clamp(max=len(self) - 1) for k in GOAL_STEPS]
+        now = torch.arange(len(self), device=self.pos.device)
+        ahead = [(now + k).clamp(max=len(self) - 1) for k in STEPS_AHEAD]
         return torch.cat([torch.cat((self.quat[j], self.pos[j]), -1) for j in ahead], -1)
 
     def time_encoding(self) -> Tensor:
-        """Return sin(c t/T) for c in ``TIME_FREQUENCIES``, then the cosines, (T, 8) (R)."""
+        """Return sin(c t/T) for each c of ``TIME_FREQUENCIES``, then cos(c t/T), (T, 8)."""
         now = torch.arange(len(self), dtype=torch.float64) / len(self)
         phase = now[:, None] * torch.tensor(TIME_FREQUENCIES, dtype=torch.float64)
-        return torch.cat((phase.sin(), phase.cos()), -1)
+        return torch.cat((phase.sin(), phase.cos()), -1).to(self.pos.device)
 
 
 @dataclass(frozen=True)
 class ExpertReference:
-    """What a person's hand did along the exemplar motion, float64; row t as in the motion."""
+    """A person's hand along the exemplar motion, float64; row t belongs to pose t of the motion."""
 
     joints: Tensor
-    """(T, nu) Adroit's joints, clipped to their limits, m and rad."""
+    """(T, nu) joints of the Adroit hand, clipped to their limits, m and rad."""
     fingertips: Tensor
-    """(T, F, 3) m, its fingertips at these joints, world frame."""
+    """(T, F, 3) m, its fingertips, world frame."""
     contacts: Tensor
-    """(T, F, 3) m, the object points that the human fingers touch or are closest to: from the
-    object's centre of mass, along the axes of its body."""
+    """(T, F, 3) m, the points of the object that the human fingers touch or are closest to: from
+    its centre of mass, in its body's frame."""
     in_contact: Tensor
     """(T, F) bool, whether the finger touches the object."""
 
@@ -91,10 +92,10 @@ class ExpertReference:
     def of(
         cls, expert: Expert, joint_low: Tensor, joint_high: Tensor, com: Tensor
     ) -> ExpertReference:
-        """Take a stored expert trajectory.
+        """Return the motion of a stored expert.
 
         Args:
-            expert: from the library.
+            expert: expert of the library.
             joint_low: lower limits of the hand's joints, (nu,) m and rad.
             joint_high: upper limits, (nu,).
             com: (3,) m, the object's centre of mass in its body's frame.
@@ -112,7 +113,7 @@ class ExpertReference:
         return self.joints.shape[0]
 
     def contact_points(self, t: Tensor, com: Tensor, quat: Tensor) -> Tensor:
-        """Return where the contact points of steps ``t`` are on the object as it lies now.
+        """Return the contact points of steps ``t`` on the object in a given pose.
 
         Args:
             t: (n,) steps since reset.

@@ -1,8 +1,21 @@
-"""A hand held around an object without touching it: a pre-grasp where nobody has shown one.
+"""A hand held around an object without touching it: a pre-grasp for a task that has none.
 
-A cross-entropy search over the hand's joints, from several directions of the wrist. It wants the
-fingertips a finger's breadth from the object, the thumb across from the others, the object in the
-middle between them, the fingers near a given posture, and nothing touched.
+A cross-entropy search over the hand's joints, started from several directions of the wrist. It
+minimises, over poses h within the joints' limits,
+
+    mean_f |d_f - d*|  +  sum_k w_k c_k(h)
+
+with d_f the distance of fingertip f from the object and d* :data:`TIP_DISTANCE_M`. The terms c_k,
+weighted by ``_WEIGHTS``:
+
+- depth: sum over contacts of how much they are closer than :data:`CLEARANCE_M`, m
+- middle: distance of the object's centre of mass from the point halfway between the thumb's tip
+  and the mean of the other tips, m
+- across: |u_thumb + u_others| of the mean unit vectors from the centre of mass to the tips, 0 if
+  the thumb opposes the others
+- posture, wrist: mean squared angle of the fingers from a given posture, of the wrist from rest
+- tendons: angle by which coupled joints exceed their tendon's range, rad
+- beyond: the caller's own objection to the pose
 """
 
 from __future__ import annotations
@@ -17,43 +30,42 @@ import numpy as np
 from pgdm import seeding
 from pgdm.cem import CemCfg, CrossEntropy
 from pgdm.errors import SceneError
-from pgdm.pregrasp.waypoints import opposing_finger
+from pgdm.library.progress import StepProgress, silent
+from pgdm.pregrasp.hand_geometry import mount_rotation, opposing_finger
 from pgdm.sim.contact import FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
 CLEARANCE_M = 0.003
-"""Distance that the search keeps; what is found touches nothing at all."""
+"""Distance that the search keeps; a pose that it returns touches nothing at all."""
 TIP_DISTANCE_M = 0.015
 """Wanted distance of the fingertips from the object."""
 
 STARTS, ROUNDS = 8, 30
-_SPREAD = (0.04, 0.3, 0.2)  # first spread: slides m, hinges rad, fingers rad
+_SPREAD = (0.04, 0.3, 0.2)  # standard deviation of the first samples: slides m, hinges, fingers rad
 _CEM = CemCfg(48, 8, added=0.03)
-_WRIST_RAD = (0.7, 0.7, 1.3)  # directions of the wrist that are begun at, rad about each axis
+_WRIST_RAD = (0.7, 0.7, 1.3)  # starting directions of the wrist: largest angle about each axis
 _WEIGHTS = {
-    "depth": 20.0,  # a metre of penetration, against metres of distance
+    "depth": 20.0,
     "middle": 0.5,
     "across": 0.03,
-    "posture": 0.01,  # a radian^2 of the fingers away from their posture
-    "wrist": 0.01,  # a radian^2 of the wrist away from its rest
-    "tendons": 0.1,  # a radian that joints are apart which a tendon couples
+    "posture": 0.01,
+    "wrist": 0.01,
+    "tendons": 0.1,
     "beyond": 5.0,
 }
 
 
 @dataclass(frozen=True)
 class NearPose:
-    """A pose that was found."""
+    """A pose that the search found."""
 
     qpos: np.ndarray  # (nq,) whole scene
     cost: float
-    tip_distances_m: np.ndarray  # (F,) of the fingertips' links from the object
+    tip_distances_m: np.ndarray  # (F,) from the fingertips' links to the object
 
 
 Beyond = Callable[[np.ndarray], float]
-"""qpos (nq,) -> by how much the wrist would leave its range on the way, m or rad; 0 is good."""
-Told = Callable[[int, int], None]
-"""Told how many of how many directions are searched."""
+"""qpos (nq,) -> how far the base would leave its range along the motion, m or rad; 0 is best."""
 
 
 def poses_near(
@@ -62,17 +74,17 @@ def poses_near(
     fingers: np.ndarray,
     beyond: Beyond,
     seed: int = 0,
-    progress: Told = lambda done, total: None,
+    progress: StepProgress = silent,
 ) -> list[NearPose]:
     """Search poses of the hand near the object; equal arguments give equal poses.
 
     Args:
-        scene: of the task.
-        qpos: whole scene (nq,); the objects stay as they are there.
-        fingers: wanted finger joints (J,), rad.
-        beyond: what else speaks against a pose.
-        seed: of the search.
-        progress: told how far it is.
+        scene: scene of the task.
+        qpos: whole scene (nq,); objects stay where they are.
+        fingers: posture (J,) rad that the finger joints should stay near.
+        beyond: further cost of a pose.
+        seed: seed of the search.
+        progress: called once per starting direction.
 
     Returns:
         Poses that touch nothing, the best first.
@@ -84,21 +96,21 @@ def poses_near(
     stream = seeding.numpy_stream(seed, "near")
     found = []
     for start in range(STARTS):
-        progress(start, STARTS)
+        progress("pre-grasp search", start, STARTS)
         pose = search.run(stream, first=start == 0)
         if pose is not None:
             found.append(pose)
-    progress(STARTS, STARTS)
+    progress("pre-grasp search", STARTS, STARTS)
     if not found:
         raise SceneError(
-            f"no pose of hand '{scene.hand.name}' near the object was found that touches nothing; "
-            "put the object elsewhere on the table, or give a pose with --pregrasp FILE"
+            f"found no pose of hand '{scene.hand.name}' near the object that touches nothing; "
+            "move the object elsewhere on the table, or pass a pose with --pregrasp FILE"
         )
     return sorted(found, key=lambda pose: pose.cost)
 
 
 class _Search:
-    """The search's scene, and what a pose costs in it."""
+    """The search in one scene, and the cost of a pose there."""
 
     def __init__(self, scene: Scene, qpos: np.ndarray, fingers: np.ndarray, beyond: Beyond) -> None:
         self._scene, self._qpos, self._beyond = scene, qpos, beyond
@@ -106,14 +118,15 @@ class _Search:
         self._model = model = copy.copy(scene.model)
         model.geom_margin[:] = np.maximum(model.geom_margin, CLEARANCE_M)
         self._data = mujoco.MjData(model)
-        nu, base = model.nu, scene.index.num_base_joints
-        self._nu, self._base = nu, base
+        n, base = scene.index.num_joints, scene.index.num_base_joints
+        self._n, self._base = n, base
         self._first = self._contact.first_finger_joint
-        self._low, self._high = model.jnt_range[:nu].T.copy()
-        self._posture = np.zeros(nu)
+        self._low, self._high = model.jnt_range[:n].T.copy()
+        self._posture = np.zeros(n)
         self._posture[self._first :] = fingers
         self._posture = self._posture.clip(self._low, self._high)
-        self._scale = np.full(nu, _SPREAD[2])
+        scene.index.couplings.apply(self._posture)
+        self._scale = np.full(n, _SPREAD[2])
         self._scale[:3], self._scale[3:base] = _SPREAD[0], _SPREAD[1]
         self._tips = scene.index.point_geoms[scene.index.fingertips]
         thumb = opposing_finger(scene, self._contact)
@@ -123,16 +136,17 @@ class _Search:
         self._distance = FingertipDistance(scene)
 
     def run(self, stream: np.random.Generator, first: bool) -> NearPose | None:
-        """Search from one direction of the wrist, the hand's own one first."""
+        """Search from one direction of the wrist: at rest if ``first``, else a random one."""
         start = self._posture.copy()
         limits = np.array(_WRIST_RAD[: self._base - 3])
         start[3 : self._base] = 0.0 if first else stream.uniform(-limits, limits)
         start = self._centred(start.clip(self._low, self._high))
-        search = CrossEntropy(np.zeros(self._nu), np.ones(self._nu), _CEM, stream)
+        search = CrossEntropy(np.zeros(self._n), np.ones(self._n), _CEM, stream)
         best, best_cost = None, np.inf
         for _ in range(ROUNDS):
             moves = search.ask()
             joints = (start + self._scale * moves).clip(self._low, self._high)
+            self._scene.index.couplings.apply(joints)
             costs = np.array([self._cost(row)[0] for row in joints])
             first_of_round = search.tell(moves, costs)[0]
             if costs[first_of_round] < best_cost:
@@ -140,13 +154,13 @@ class _Search:
         if best is None:
             return None
         cost, distances = self._cost(best)
-        qpos = np.concatenate((best, self._qpos[self._nu :]))
+        qpos = np.concatenate((best, self._qpos[self._n :]))
         if self._contact.depth(qpos) > 0.0:
             return None
         return NearPose(qpos, cost, distances)
 
     def _cost(self, joints: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return what a pose costs, and the fingertips' distances (F,) m."""
+        """Return the cost of a pose, and the fingertips' distances (F,) m."""
         model, data = self._model, self._data
         self._place(joints)
         mujoco.mj_collision(model, data)
@@ -154,9 +168,9 @@ class _Search:
         distances = self._distance(data)
         com = data.xipos[self._scene.index.object_body]
         tips = data.geom_xpos[self._tips]
-        ways = tips - com
-        ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-6)
-        across = np.linalg.norm(ways[self._thumb].mean(axis=0) + ways[~self._thumb].mean(axis=0))
+        units = tips - com
+        units /= np.maximum(np.linalg.norm(units, axis=1, keepdims=True), 1e-6)
+        across = np.linalg.norm(units[self._thumb].mean(axis=0) + units[~self._thumb].mean(axis=0))
         fingers = joints[self._first :] - self._posture[self._first :]
         terms = {
             "depth": depth,
@@ -165,39 +179,37 @@ class _Search:
             "posture": float((fingers**2).mean()),
             "wrist": float((joints[3 : self._first] ** 2).mean()),
             "tendons": self._tendons.beyond_rad(data),
-            "beyond": self._beyond(np.concatenate((joints, self._qpos[self._nu :]))),
+            "beyond": self._beyond(np.concatenate((joints, self._qpos[self._n :]))),
         }
         cost = float(np.abs(distances - TIP_DISTANCE_M).mean())
         return cost + sum(_WEIGHTS[name] * value for name, value in terms.items()), distances
 
     def _place(self, joints: np.ndarray) -> None:
         self._data.qpos[:] = self._qpos
-        self._data.qpos[: self._nu] = joints
+        self._data.qpos[: self._n] = joints
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_tendon(self._model, self._data)
 
     def _middle(self) -> np.ndarray:
-        """Return the point (3,) m, world frame, between the thumb's tip and the others."""
+        """Return the point (3,) m, world frame, between the thumb's tip and the others' mean."""
         tips = self._data.geom_xpos[self._tips]
         return 0.5 * (tips[self._thumb].mean(axis=0) + tips[~self._thumb].mean(axis=0))
 
     def _centred(self, joints: np.ndarray) -> np.ndarray:
-        """Return joints with the slides moved so that the fingertips are around the object."""
+        """Return joints (n,) with the slides moved so that the fingertips surround the object."""
         self._place(joints)
-        mount = np.empty(9)
-        mujoco.mju_quat2Mat(mount, self._scene.index.mount_quat)
-        way = self._data.xipos[self._scene.index.object_body] - self._middle()
+        shift = self._data.xipos[self._scene.index.object_body] - self._middle()
         moved = joints.copy()
-        moved[:3] += mount.reshape(3, 3).T @ way
+        moved[:3] += mount_rotation(self._scene).T @ shift
         return moved.clip(self._low, self._high)
 
 
 class _Tendons:
-    """Tells how far joints are beyond what tendons with a limit allow: no servo brings them there.
+    """How far joints exceed the range of limited tendons, where no servo can bring them.
 
     Args:
-        model: its fixed tendons are measured, whose length is a sum of joints times arms.
+        model: only its fixed tendons count; their length is a weighted sum of joint angles.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -209,7 +221,7 @@ class _Tendons:
         self._range = model.tendon_range[self._which]
 
     def beyond_rad(self, data: mujoco.MjData) -> float:
-        """Return the sum over the tendons, as an angle of the joint with the longest arm."""
+        """Return the excess summed over tendons, as the angle of the joint with the longest arm."""
         length = data.ten_length[self._which]
         over = np.maximum(self._range[:, 0] - length, length - self._range[:, 1]).clip(0.0)
         return float((over / self._arms).sum())

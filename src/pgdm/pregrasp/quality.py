@@ -1,4 +1,4 @@
-"""How good a pre-grasp is: free of contact, near, facing the object, and able to lift it."""
+"""Quality of a pre-grasp: free of contact, near the object, facing it, and able to lift it."""
 
 from __future__ import annotations
 
@@ -12,53 +12,55 @@ from pgdm import seeding
 from pgdm.errors import ConfigError
 from pgdm.library import Start
 from pgdm.pregrasp.flexion import Flexion
+from pgdm.pregrasp.hand_geometry import mount_rotation, posed
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.contact import FREE_M, FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
 LIFT_M = 0.02
-"""How far the object's centre of mass must rise: as much as earns the reward's bonus (SPEC 1)."""
-CARRY_M = 0.1
-"""How far the palm is carried up, or as far as its slides go."""
+"""How far the object's centre of mass must rise: as far as for the reward's lift bonus."""
+RAISE_M = 0.1
+"""How far the hand is raised, or as far as its slides go."""
 PRESS_M = 0.03
-"""How far a policy moves the palm along its own direction while it closes, at most."""
-_SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # deviation of the wrist, and of joints that do not close
-_PRESS_STEPS = 8
-_CLOSE_STEPS, _LIFT_STEPS, _HOLD_STEPS = 20, 25, 15  # control steps
-_FASTEST, _SLOWEST = 4, 16  # steps in which a finger closes
-_GRIP, _FINGER, _JOINT = (0.3, 1.0), (0.5, 1.0), (0.7, 1.3)  # shares of the way to full flexion
+"""How far at most a policy pushes the palm in the direction it faces while the hand closes."""
+_SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # std of the hand's shift, and of joints that do not close
+_PRESS_STEPS, _CLOSE_STEPS, _LIFT_STEPS, _HOLD_STEPS = 8, 20, 25, 15  # control steps
+_FASTEST, _SLOWEST = 4, 16  # control steps in which a finger closes
+_GRIP, _FINGER, _JOINT = (0.3, 1.0), (0.5, 1.0), (0.7, 1.3)  # factors of full flexion
 
 
 @dataclass(frozen=True)
 class Quality:
-    """What can be said of a pre-grasp."""
+    """Measurements of a pre-grasp."""
 
     free: bool
     """Whether the hand touches nothing."""
     depth_m: float
     """Deepest penetration of the hand and anything else."""
     fingertip_distance_m: float
-    """From the collision surface of the fingers' last links to the object's, mean over fingers; a
-    link that cuts into it counts as 0."""
+    """Distance from the collision surface of each finger's last link to the object's, mean over
+    fingers; a link that penetrates it counts as 0."""
     palm_angle_rad: float
-    """Between where the palm looks and the way from its middle to the object's centre of mass."""
+    """Angle between the direction the palm faces and that from its middle to the object's centre
+    of mass."""
     lift_rate: float
-    """Share of random closing policies that lift the object and hold it; NaN if not tested, or if
-    the object cannot be lifted, such as a door."""
+    """Share of random closing policies that lift the object and hold it; NaN if not tested, or for
+    an object that cannot be lifted, such as a door."""
 
 
 class LiftTest:
-    """Closes the fingers in many random ways, carries the palm up, and looks at the object.
+    """Closes the fingers in many random ways and raises the hand: is the object lifted?
 
-    A policy presses the palm a little towards where it looks, closes each finger at a speed of its
-    own by a random share of the way to full flexion, then raises the wrist. Equal arguments give
-    an equal result, whatever the number of threads.
+    A policy pushes the palm a little in the direction it faces and closes each finger at its own
+    speed by a random share of full flexion, then raises the hand by :data:`RAISE_M`. It succeeds
+    if the object stays :data:`LIFT_M` above its start while the hand then holds still. Equal
+    arguments give an equal result, whatever the number of threads.
 
     Args:
-        scene: of the task.
+        scene: scene of the task.
         substeps: physics steps per control step.
-        num_policies: how many policies are tried.
-        seed: of their random numbers.
+        num_policies: N, how many policies are tried.
+        seed: seed of the policies.
         num_threads: 0 takes one per core.
     """
 
@@ -72,7 +74,7 @@ class LiftTest:
     ) -> None:
         self._scene, self._flexion = scene, Flexion(scene)
         self.made_for = scene.digest(), substeps
-        """Scene and speed that it tests."""
+        """Digest of the scene, and substeps, that it tests."""
         self._sim = SimBatch(scene, num_policies, num_threads, substeps)
         self._all = np.arange(num_policies)
         fingers, n = self._flexion.num_fingers, num_policies
@@ -81,10 +83,8 @@ class LiftTest:
         shares = grip[:, of_joint] * random.uniform(*_JOINT, (n, len(of_joint)))
         self._shares = shares.clip(0.0, 1.0)  # (N, J)
         self._steps = random.uniform(_FASTEST, _SLOWEST, (n, fingers))[:, of_joint]  # (N, J)
-        mount = np.empty(9)
-        mujoco.mju_quat2Mat(mount, scene.index.mount_quat)
-        self._mount = mount.reshape(3, 3)
-        self._carry = CARRY_M * self._mount[2]  # (3,) m, of the slides
+        self._mount = mount_rotation(scene)
+        self._raise = RAISE_M * self._mount[2]  # (3,) m, of the slides
         self._press = random.uniform(0.0, PRESS_M, (n, 1))
         self._shift = random.normal(0.0, _SHIFT_M, (n, 3))
         self._spread = random.normal(0.0, _SPREAD_RAD, shares.shape)  # (N, J)
@@ -92,25 +92,26 @@ class LiftTest:
         """Whether the object can be lifted at all."""
 
     def __call__(self, start: Start) -> float:
-        """Return the share of policies that lift the object and hold it; NaN if none ever could."""
+        """Return the share of policies that lift the object; NaN if it cannot be lifted."""
         return float(self.lifted(start).mean()) if self.possible else math.nan
 
     def lifted(self, start: Start) -> np.ndarray:
-        """Return which policies do, (N,) bool."""
+        """Return which policies lift and hold the object, (N,) bool."""
         sim, index, first = self._sim, self._scene.index, self._flexion.first
         sim.reset(self._all, start.qpos, start.qvel)
         height = float(sim.read().object_pos[0, 2])
-        begin = start.qpos[: index.num_actuators]
+        begin = start.qpos[: index.num_joints]
         closed = self._flexion.closed
         shift = self._press * (self._flexion.palm(start.qpos)[1] @ self._mount) + self._shift
-        way = np.where(np.isnan(closed), self._spread, (closed - begin[first:]) * self._shares)
+        bend = np.where(np.isnan(closed), self._spread, (closed - begin[first:]) * self._shares)
         targets = np.repeat(begin[None], len(self._all), 0)
         failed, held = np.zeros(len(self._all), bool), np.ones(len(self._all), bool)
         for k in range(1, _CLOSE_STEPS + _LIFT_STEPS + _HOLD_STEPS + 1):
-            targets[:, first:] = begin[first:] + way * (k / self._steps).clip(max=1.0)
+            targets[:, first:] = begin[first:] + bend * (k / self._steps).clip(max=1.0)
             up = min(max((k - _CLOSE_STEPS) / _LIFT_STEPS, 0.0), 1.0)
-            targets[:, :3] = begin[:3] + min(k / _PRESS_STEPS, 1.0) * shift + up * self._carry
-            failed |= sim.step(targets.clip(index.ctrl_low, index.ctrl_high))
+            targets[:, :3] = begin[:3] + min(k / _PRESS_STEPS, 1.0) * shift + up * self._raise
+            driven = targets[:, index.driven]
+            failed |= sim.step(driven.clip(index.ctrl_low, index.ctrl_high))
             if k > _CLOSE_STEPS + _LIFT_STEPS:
                 held &= sim.read().object_pos[:, 2].numpy() >= height + LIFT_M
         return held & ~failed
@@ -120,26 +121,24 @@ def quality(scene: Scene, qpos: np.ndarray, substeps: int, lift: LiftTest | None
     """Measure a pre-grasp.
 
     Args:
-        scene: of the task.
+        scene: scene of the task.
         qpos: whole scene (nq,) with the hand at its pre-grasp.
         substeps: physics steps per control step.
-        lift: test of this scene, or None to leave it out, as it takes a second.
+        lift: test of this scene, or None to skip it, as it takes a second.
 
     Raises:
-        ConfigError: if the test was made for another scene or speed.
+        ConfigError: the lift test belongs to another scene or number of substeps.
     """
     if lift is not None and lift.made_for != (scene.digest(), substeps):
         raise ConfigError(
-            f"this lift test was made for another scene or speed than that of task "
+            f"the lift test is for another scene or number of substeps than task "
             f"'{scene.task.id}' with hand '{scene.hand.name}' and {substeps} substeps"
         )
     depth = HandContact(scene).depth(qpos)
     centre, normal = Flexion(scene).palm(qpos)
-    data = mujoco.MjData(scene.model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(scene.model, data)
-    way = data.xipos[scene.index.object_body] - centre
-    cosine = float(normal @ way / max(float(np.linalg.norm(way)), 1e-9))
+    data = posed(scene, qpos)
+    to_object = data.xipos[scene.index.object_body] - centre
+    cosine = float(normal @ to_object / max(float(np.linalg.norm(to_object)), 1e-9))
     rate = math.nan if lift is None else lift(Start(qpos, np.zeros(scene.model.nv), None))
     return Quality(
         free=depth <= FREE_M,
@@ -151,7 +150,7 @@ def quality(scene: Scene, qpos: np.ndarray, substeps: int, lift: LiftTest | None
 
 
 def _can_rise(scene: Scene) -> bool:
-    """Return whether the object has joints of its own that lead it upwards."""
+    """Return whether the object has joints other than hinges, so that it can move up."""
     model, body = scene.model, scene.index.object_body
     while body:
         first = model.body_jntadr[body]

@@ -1,1 +1,1 @@
-"""Results as a page, tables and pictures, beside the paper's and those of doing nothing."""
+"""Results as a page, tables and figures, compared with the paper and with doing nothing."""

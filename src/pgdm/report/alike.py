@@ -1,4 +1,4 @@
-"""Runs that count as alike by what was asked for, and were not made alike."""
+"""Runs that have one setting but differ in start, assets or scene."""
 
 from __future__ import annotations
 
@@ -9,45 +9,45 @@ from pgdm.report.results import Results
 from pgdm.report.runs import Run
 from pgdm.report.settings import Setting
 
-# What a reader is told -> the key in a run's result. It depends on the machine's assets.
+# Name on the page -> key in result.json. These depend on the assets of the machine.
 _FACTS = {"start": "pregrasp_used", "asset source": "asset_source"}
 
 
 class Mixed(NamedTuple):
-    """A fact in which finished runs of one setting differ."""
+    """A fact in which the finished runs of a setting differ."""
 
     setting: Setting
     fact: str
     counts: dict[str, int]
-    """Value to runs."""
+    """Value to number of runs."""
 
 
 class Double(NamedTuple):
-    """A run that is left out."""
+    """A run that is left out because another one counts."""
 
     run: Run
     differences: list[str]
-    """In what it was made otherwise than the one that counts."""
+    """Facts in which it differs from the run that counts."""
 
 
 def mixed(results: Results) -> list[Mixed]:
-    """Return in what the finished runs of settings differ; what a run does not tell is no value."""
+    """Return the facts in which finished runs of a setting differ; unrecorded facts are ignored."""
     found = []
     for setting in results.settings:
-        made = [_made(run) for run in results.runs if run.setting == setting and run.finished]
-        for fact in dict.fromkeys(fact for facts in made for fact in facts):
-            counts = Counter(facts[fact] for facts in made if fact in facts)
+        runs = [_facts(run) for run in results.runs if run.setting == setting and run.finished]
+        for fact in dict.fromkeys(fact for facts in runs for fact in facts):
+            counts = Counter(facts[fact] for facts in runs if fact in facts)
             if len(counts) > 1:
                 found.append(Mixed(setting, fact, dict(counts.most_common())))
     return found
 
 
 def left_out(results: Results) -> list[Double]:
-    """Return the runs of which another one counts, those that were made otherwise first."""
+    """Return the runs that are left out, those that differ from the counted run first."""
     counted = {(run.setting, run.task, run.seed): run for run in results.runs}
     found = []
     for run in results.doubles:
-        own, other = _made(run), _made(counted[run.setting, run.task, run.seed])
+        own, other = _facts(run), _facts(counted[run.setting, run.task, run.seed])
         differences = [
             f"{fact} {own[fact]}, not {other[fact]}"
             for fact in own
@@ -57,12 +57,12 @@ def left_out(results: Results) -> list[Double]:
     return sorted(found, key=lambda double: not double.differences)
 
 
-def _made(run: Run) -> dict[str, str]:
-    """Return what a run tells of the facts.
+def _facts(run: Run) -> dict[str, str]:
+    """Return the facts that a run recorded.
 
-    A scene is compared with those of the same task and source only: others differ anyway.
+    A scene is a fact of its task and asset source, since only scenes of the same two compare.
     """
-    told = {fact: run.result.get(key) for fact, key in _FACTS.items()}
+    found = {fact: run.result.get(key) for fact, key in _FACTS.items()}
     if (scene := run.result.get("scene_sha256")) is not None:
-        told[f"{told['asset source']} {run.task} scene"] = str(scene)[:8]
-    return {fact: str(value) for fact, value in told.items() if value is not None}
+        found[f"{found['asset source']} {run.task} scene"] = str(scene)[:8]
+    return {fact: str(value) for fact, value in found.items() if value is not None}

@@ -1,4 +1,4 @@
-"""Learning curves: a panel for each task, all of them in one picture."""
+"""Learning curves: one figure with a panel for each task."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from pgdm.config.store import PAPER_FRAMES
+from pgdm.config.compose import PAPER_FRAMES
 from pgdm.report.figures import DPI, axis_end, colour, png
 from pgdm.report.results import Array, Results, known, paper
 from pgdm.report.runs import ERROR, SUCCESS, Run
 
-# Inches: a panel, and the drawing in it (left, bottom, width, height).
+# Inches: a panel, and the axes in it (left, bottom, width, height).
 _PANEL = (2.9, 2.2)
 _INNER = (0.5, 0.35, 2.25, 1.5)
-_LEGEND = 0.2  # each line
+_LEGEND = 0.2  # height of a line
 _COLUMNS = 5
-_POINTS = 200  # of a mean curve at most
+_POINTS = 200  # of a mean curve, at most
 _NAMES = {SUCCESS: "success", ERROR: "COM error, released form [m]"}
 _PAPER = {SUCCESS: "paper_success", ERROR: "paper_com_error"}
 _GREY = "#888888"
@@ -34,7 +34,7 @@ _GREY = "#888888"
 
 @dataclass(frozen=True)
 class _Scale:
-    """From frames and values to a panel's unit square; the same for all panels."""
+    """Maps frames and values to a panel's unit square; the same for all panels."""
 
     logarithmic: bool
     furthest: float  # frames
@@ -42,13 +42,13 @@ class _Scale:
     high: float
 
     def __call__(self, frames: Array, values: Array) -> Array:
-        """Return places in the unit square, (N, 2); what is not finite is left out."""
+        """Return points in the unit square, (N, 2); values that are not finite are left out."""
         y = np.log10(values.clip(10.0**self.low)) if self.logarithmic else values
         places = np.column_stack([frames / self.furthest, (y - self.low) / (self.high - self.low)])
         return places[np.isfinite(places).all(axis=1)].clip(-0.02, 1.02)
 
     def ticks(self) -> Iterator[tuple[float, str]]:
-        """Give the values to mark, each with its text."""
+        """Yield the values of the ticks, each with its label."""
         if self.logarithmic:
             for power in range(round(self.low), round(self.high) + 1):
                 yield 10.0**power, f"$10^{{{power}}}$"
@@ -57,14 +57,20 @@ class _Scale:
 
 
 def curves(
-    results: Results, metric: str, file: Path, tell: Callable[[int, int], None]
+    results: Results, metric: str, file: Path, progress: Callable[[int, int], None]
 ) -> dict[str, bytes]:
-    """Draw a metric over frames, a panel a task; write all as one PNG.
+    """Draw a metric over frames, a panel for each task, and write them as one PNG.
 
-    One pair of axes holds all panels: fifty pairs would take five times as long.
+    A single pair of axes holds all panels, since fifty pairs take five times as long.
+
+    Args:
+        results: the runs.
+        metric: ``SUCCESS`` or ``ERROR``.
+        file: the PNG.
+        progress: called with the numbers of panels drawn and to draw.
 
     Returns:
-        Task to its panel alone, PNG.
+        Task to the PNG of its panel.
     """
     columns = min(_COLUMNS, len(results.tasks))
     legend = _LEGEND * (len(results.settings) + 2)
@@ -75,14 +81,14 @@ def curves(
     scale = _scale(results, metric)
     corners = {}
     for number, task in enumerate(results.tasks):
-        tell(number, len(results.tasks))
+        progress(number, len(results.tasks))
         row, column = divmod(number, columns)
         left, top = column * _PANEL[0], row * _PANEL[1]
         corners[task] = round(DPI * left), round(DPI * top)
         _panel(axes, (left, height - top - _PANEL[1]), scale, results, task, metric)
     handles = [Line2D([], [], color=colour(results, s)) for s in results.settings]
     names = [results.labels[s] for s in results.settings]
-    title = f"{_NAMES[metric]} over million frames"
+    title = f"{_NAMES[metric]} over millions of frames"
     figure.legend(handles, names, loc="lower left", title=title, frameon=False, fontsize=8)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -100,7 +106,7 @@ def _panel(
     task: str,
     metric: str,
 ) -> None:
-    """Draw a task's panel with its lower left corner at a place, in inches."""
+    """Draw a task's panel with its lower left corner at a point, in inches."""
     origin = np.array([corner[0] + _INNER[0], corner[1] + _INNER[1]])
     size = np.array(_INNER[2:])
 
@@ -135,18 +141,18 @@ def _panel(
 
 
 def _levels(results: Results, task: str, metric: str) -> Iterator[tuple[float, str]]:
-    """Give what a task's curves are to be compared with, and the style of its line."""
+    """Yield the reference values of a task, each with the style of its line."""
     null = paper()["null_policy"].get(task)
     if metric == SUCCESS and null is not None:
         yield null, ":"
     runs = [run for setting in results.settings for run in results.cell(setting, task)]
-    figure = known(runs[0], _PAPER[metric])
-    if max(run.frames for run in runs) >= PAPER_FRAMES and np.isfinite(figure):
-        yield figure, "--"
+    value = known(runs[0], _PAPER[metric])
+    if max(run.frames for run in runs) >= PAPER_FRAMES and np.isfinite(value):
+        yield value, "--"
 
 
 def _frame(axes: Axes, place: Callable[[Array, Array], Array], scale: _Scale) -> None:
-    """Draw a panel's axes with their ticks."""
+    """Draw the axes of a panel with their ticks."""
     values = list(scale.ticks())
     low, high = values[0][0], values[-1][0]
     corner = place(np.array([0.0, 0.0, scale.furthest]), np.array([high, low, low]))
@@ -173,12 +179,12 @@ def _scale(results: Results, metric: str) -> _Scale:
 
 
 def mean_curve(runs: Sequence[Run], metric: str) -> tuple[Array, Array, Array]:
-    """Return frames, mean and standard deviation over runs, as far as all of them have come."""
+    """Return frames, mean and standard deviation over runs, up to the end of the shortest."""
     return mean_line([(run.evaluations["frames"], run.evaluations[metric]) for run in runs])
 
 
 def mean_line(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
-    """Return the same over lines of frames and values."""
+    """Return the same over pairs of frames and values, interpolated linearly."""
     last = min(frames[-1] for frames, _ in lines)
     every = np.unique(np.concatenate([frames for frames, _ in lines]))
     every = every[every <= last]

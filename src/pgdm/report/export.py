@@ -1,4 +1,4 @@
-"""Every number of the page as CSV, and what it was computed from."""
+"""All numbers of the page as CSV, and the data they were computed from."""
 
 from __future__ import annotations
 
@@ -16,14 +16,7 @@ from pgdm.report.statistics import Estimate
 from pgdm.report.tables import THRESHOLDS, Average, Improvement
 from pgdm.report.task_table import TaskRow
 
-FILES = (
-    "runs.csv",
-    "tasks.csv",
-    "averages.csv",
-    "statistics.csv",
-    "profiles.csv",
-    "curves.csv",
-)
+FILES = ("runs.csv", "tasks.csv", "averages.csv", "statistics.csv", "profiles.csv", "curves.csv")
 
 FACTS = (
     "asset_source",
@@ -34,14 +27,14 @@ FACTS = (
     "ablation_finger_error_rad",
     "ablation_depth_mm",
 )
-"""What a run tells of itself, of its ablated start only with an ablation."""
+"""Keys of ``result.json`` in ``runs.csv``; those of an ablated start need an ablation."""
 
 Aggregates = dict[Setting, tuple[Estimate, list[Estimate], int, int]]
 Improvements = dict[tuple[Setting, Setting], Improvement]
 
 
 def runs(results: Results, out: Path) -> None:
-    """Write ``runs.csv``: the last evaluation of each run, which all tables come from."""
+    """Write ``runs.csv``: the last evaluation of each run, the source of all tables."""
     head = ["task", "setting", "seed", "state", "counted", "frames", "total_frames", "budget"]
     rows = [
         [
@@ -54,11 +47,7 @@ def runs(results: Results, out: Path) -> None:
         ]
         for run in results.runs
     ]
-    _write(
-        out / "runs.csv",
-        [*head, "start", *FACTS, *METRICS, "folder"],
-        rows,
-    )
+    _write(out / "runs.csv", [*head, "start", *FACTS, *METRICS, "folder"], rows)
 
 
 def tasks(results: Results, rows: Iterable[TaskRow], out: Path) -> None:
@@ -73,7 +62,7 @@ def tasks(results: Results, rows: Iterable[TaskRow], out: Path) -> None:
             " ".join(f"{seed}:{state}" for seed, state in row.seeds.items()),
             *(row.frames, row.success, row.success_mean_action, row.error, row.lifted),
             *(row.fingertips, row.contacts),
-            *(row.paper_success, row.paper_error, row.difference, row.null, row.bound),
+            *(row.paper_success, row.paper_error, row.difference, row.null, row.rigid_grasp),
             "yes" if row.comparable else "no",
         ]
         for row in rows
@@ -120,7 +109,7 @@ def statistics(results: Results, found: Aggregates, better: Improvements, out: P
 
 
 def curves(results: Results, out: Path) -> None:
-    """Write ``curves.csv``: every evaluation, and the return of training, thinned."""
+    """Write ``curves.csv``: every evaluation, and the training return, thinned."""
     table = []
     for run in results.runs:
         who = [run.task, results.labels[run.setting], run.seed]
@@ -136,7 +125,7 @@ def curves(results: Results, out: Path) -> None:
 
 
 def _write(file: Path, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a table; what is not known stays empty."""
+    """Write a table; unknown values stay empty."""
     with open(file, "w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow(head)

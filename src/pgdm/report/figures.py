@@ -1,4 +1,4 @@
-"""The report's small pictures: statistics, and frames of films."""
+"""The figures of the report, except learning curves; thumbnails of its videos."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageColor
 
+from pgdm import files
 from pgdm.report.results import Results
 from pgdm.report.runs import ERROR, SUCCESS
 from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
 from pgdm.report.tables import THRESHOLDS, Average, by_group
 
-# Okabe and Ito's colours, which colour-blind people can tell apart, then darker ones.
+# Okabe and Ito's colours, which colour-blind people can distinguish, then darker ones.
 COLOURS = (
     *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F", "#000000"),
     *("#332288", "#882255", "#999933", "#44AA99", "#117733", "#AA4499", "#661100", "#6699CC"),
@@ -34,31 +35,31 @@ RGBA = tuple[float, float, float, float]
 Pairs = tuple[Figure, list[tuple[Axes, Axes]]]
 _WIDTH_IN = 5.2
 _PALE = 0.45  # opacity without pre-grasps
-_CEILINGS = (0.1, 0.2, 0.5, 1.0)  # success that axes may end at
-_THUMB = (240, 180)  # pixels of a film's picture
-_SHADES = 12  # of a colour in a drawing: lines have soft edges
+_CEILINGS = (0.1, 0.2, 0.5, 1.0)  # upper limits of success axes
+_THUMB = (240, 180)  # pixels
+_SHADES = 12  # of each colour, for antialiased lines
 
 
 def colour(results: Results, setting: Setting) -> str:
-    """Return a setting's colour; after all of them they begin again."""
+    """Return a setting's colour; more settings than colours reuse them."""
     return COLOURS[results.settings.index(setting) % len(COLOURS)]
 
 
 def intervals(results: Results, estimates: dict[Setting, Estimate], name: str) -> Figure:
-    """Draw one estimate of success a setting, with its interval."""
+    """Draw an estimate of success for each setting, with its interval."""
     figure, axes = _rows([results.labels[setting] for setting in estimates])
     for row, (setting, (value, low, high)) in enumerate(estimates.items()):
         shade = colour(results, setting)
         axes.plot([low, high], [row, row], color=shade, lw=6, alpha=0.35)
         axes.plot([value], [row], "o", color=shade, ms=5, clip_on=False)
     low, high = axes.get_xlim()
-    axes.set_xlim(max(low, 0.0), min(high, 1.0))  # no success lies beyond
+    axes.set_xlim(max(low, 0.0), min(high, 1.0))  # the range of success
     axes.set_xlabel(name, fontsize=9)
     return figure
 
 
 def profiles(results: Results, found: dict[Setting, list[Estimate]]) -> Figure:
-    """Draw performance profiles with their bands."""
+    """Draw performance profiles with their confidence bands."""
     figure, axes = _plain(3.0 + 0.18 * len(found))
     for setting, estimates in found.items():
         value, low, high = np.array(estimates).T
@@ -66,14 +67,14 @@ def profiles(results: Results, found: dict[Setting, list[Estimate]]) -> Figure:
         axes.plot(THRESHOLDS, value, color=shade, lw=1.8, label=results.labels[setting])
         axes.fill_between(THRESHOLDS, low, high, color=shade, alpha=0.18, lw=0)
     axes.set(xlim=(0, 1), ylim=(0, 1.02))
-    axes.set_xlabel("success of more than", fontsize=9)
+    axes.set_xlabel("success above", fontsize=9)
     axes.set_ylabel("share of runs", fontsize=9)
     figure.legend(loc="outside lower left", fontsize=8, frameon=False)
     return figure
 
 
 def bars(rows: Sequence[Average]) -> Figure:
-    """Draw success and error of methods, each group of rows by itself."""
+    """Draw success and error of methods as bars, a panel for each group of rows."""
     shade, groups = shades(rows), by_group(rows)
     row_in = _row_in([row.name for row in rows])
     heights = [row_in * len(own) for own in groups.values()]
@@ -97,9 +98,9 @@ def bars(rows: Sequence[Average]) -> Figure:
 
 
 def shades(rows: Sequence[Average]) -> dict[Setting, RGBA]:
-    """Return the rows' colours: pale without pre-grasps, the hue by their names.
+    """Return the rows' colours: the hue by name, pale without pre-grasps.
 
-    All groups share one legend, so a name has one hue whatever the setting differs in besides.
+    All groups share one legend, so a name has the same hue in each of them.
     """
     hues = list(dict.fromkeys(row.hue for row in rows))
     return {
@@ -112,9 +113,9 @@ def shades(rows: Sequence[Average]) -> dict[Setting, RGBA]:
 
 
 def axis_end(metric: str, most: float) -> float:
-    """Return where an axis of success or of error ends, so that its largest value has room."""
+    """Return the upper limit of an axis of success or error for a largest value."""
     if metric == SUCCESS:
-        return next(high for high in _CEILINGS if high >= most)
+        return next((high for high in _CEILINGS if high >= most), most)
     return 1.1 * most or 1.0
 
 
@@ -122,12 +123,12 @@ def pairs(heights_in: Sequence[float], more_in: float, **shared: Any) -> Pairs:
     """Return axes for success and error side by side, a pair for each height.
 
     Args:
-        heights_in: of the drawings themselves.
-        more_in: what is around all of them.
-        shared: which axes are one, as Matplotlib's ``subplots`` takes it.
+        heights_in: heights of the axes.
+        more_in: height of everything around them.
+        shared: ``sharex`` and ``sharey`` of Matplotlib's ``subplots``.
     """
     figure = _figure(sum(heights_in) + more_in)
-    figure.set_layout_engine("constrained", w_pad=0.1)  # the last tick's text would be cut off
+    figure.set_layout_engine("constrained", w_pad=0.1)  # else the last tick's label is cut off
     grid = figure.subplots(len(heights_in), 2, squeeze=False, height_ratios=heights_in, **shared)
     for axes in grid.flat:
         _bare(axes)
@@ -135,13 +136,13 @@ def pairs(heights_in: Sequence[float], more_in: float, **shared: Any) -> Pairs:
 
 
 def few_ticks(axis: Axis, most: int) -> None:
-    """Mark round values only, shortly written, at no more than a number of steps."""
+    """Put ticks at round values, with short labels and a number of steps at most."""
     axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10]))
     axis.set_major_formatter("{x:g}")
 
 
 def wrapped(name: str, width: int = 26) -> str:
-    """Return a name in lines of about a width, cut at its commas."""
+    """Return a name broken at its commas into lines of about a width."""
     lines = [""]
     for part in name.split(", "):
         glued = f"{lines[-1]}, {part}" if lines[-1] else part
@@ -154,13 +155,13 @@ def _most(estimates: Iterable[Estimate]) -> float:
 
 
 def _extent(rows: Sequence[Average]) -> str:
-    """Return what a group's bars are means of; all its runs are equally long."""
+    """Return the tasks and frames behind a group's bars; all its runs have equal length."""
     counts = [len(row.tasks) for row in rows]
     least, most = min(counts), max(counts)
     number = f"{least}" if least == most else f"{least} to {most}"
     lines = [f"mean of {number} task{'s' if most > 1 else ''}"]
     if len({row.tasks for row in rows}) > 1:
-        lines = [f"{lines[0]},", "not the same"]
+        lines = [f"{lines[0]},", "which differ"]
     return "\n".join([*lines, f"{rows[0].setting.total_frames:,} frames"])
 
 
@@ -183,14 +184,14 @@ def _plain(height_in: float) -> tuple[Figure, Axes]:
 
 
 def _rows(names: Sequence[str]) -> tuple[Figure, Axes]:
-    """Return axes with a named row for each, the first on top."""
+    """Return axes with a row for each name, the first on top."""
     figure, axes = _plain(0.6 + _row_in(names) * len(names))
     _name_rows(axes, names)
     return figure, axes
 
 
 def _row_in(names: Sequence[str]) -> float:
-    """Return the inches that each of some named rows takes."""
+    """Return the height of each row, inches."""
     return 0.2 + 0.16 * max(1 + wrapped(name).count("\n") for name in names)
 
 
@@ -201,6 +202,20 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
     axes.grid(axis="x", lw=0.4, alpha=0.5)
 
 
+def line_axes(panels: dict[str, tuple[float, float] | None]) -> tuple[Figure, list[Axes]]:
+    """Return a figure with panels below each other: label of the values to their range, if set."""
+    figure = _figure(2.2 * len(panels) + 0.6)
+    drawn = list(figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0])
+    for axes, (label, extent) in zip(drawn, panels.items(), strict=True):
+        _bare(axes)
+        axes.grid(lw=0.4, alpha=0.5)
+        axes.set_ylabel(label, fontsize=9)
+        if extent is not None:
+            axes.set_ylim(extent)
+    drawn[-1].set_xlabel("frames", fontsize=9)
+    return figure, drawn
+
+
 def saved(figure: Figure, file: Path) -> bytes:
     """Write a figure as PNG and return it."""
     figure.savefig(file)
@@ -208,9 +223,9 @@ def saved(figure: Figure, file: Path) -> bytes:
 
 
 def thumbnail(poster: Path) -> bytes | None:
-    """Return a film's picture, made small, as JPEG; None if it cannot be read."""
+    """Return a thumbnail of a video's poster as JPEG; None if it cannot be read."""
     try:
-        with Image.open(poster) as picture:
+        with Image.open(io.BytesIO(files.read_bytes(poster))) as picture:
             small = picture.convert("RGB")
             small.thumbnail(_THUMB)
     except OSError:
@@ -221,7 +236,7 @@ def thumbnail(poster: Path) -> bytes | None:
 
 
 def png(picture: Image.Image) -> bytes:
-    """Return a drawing as PNG with few colours, a quarter of the size."""
+    """Return a figure as PNG with a small palette, a quarter of the size."""
     stream = io.BytesIO()
     picture.quantize(palette=_palette(), dither=Image.Dither.NONE).save(stream, "PNG")
     return stream.getvalue()
@@ -229,9 +244,9 @@ def png(picture: Image.Image) -> bytes:
 
 @functools.cache
 def _palette() -> Image.Image:
-    """Return greys and each of the colours, thinned by white in steps.
+    """Return a palette of greys, and of each colour in steps towards white.
 
-    A palette made from a drawing itself leaves out what little of it a short curve is.
+    A palette derived from the figure itself would miss the colour of a short curve.
     """
     shares = np.linspace(1.0, 0.0, _SHADES, endpoint=False)[:, None, None]
     colours = np.array([ImageColor.getrgb(c) for c in COLOURS])

@@ -16,10 +16,10 @@ from pgdm.report.results import Array, Results
 from pgdm.report.runs import Run
 from pgdm.report.tables import Average, by_group
 
-# Inches: a drawing, what is around it, each line of the legend.
+# Inches: axes, everything around them, a line of the legend.
 _HEIGHT_IN, _AROUND_IN, _LEGEND_IN = 1.5, 0.7, 0.18
 Tasks = Sequence[Sequence[Run]]
-"""Each task's runs."""
+"""The runs of each task."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Line:
     """A mean over tasks."""
 
     name: str
-    """In the legend; empty for none."""
+    """Name in the legend; empty for none."""
     tasks: Tasks
     style: dict[str, Any]
-    """Matplotlib's."""
+    """Keywords of Matplotlib's ``plot``."""
 
 
 Panels = dict[str, list[Line]]
@@ -40,16 +40,16 @@ Panels = dict[str, list[Line]]
 def over_tasks(tasks: Tasks, metric: str) -> tuple[Array, Array]:
     """Return frames, and the mean over tasks of each task's mean over its runs.
 
-    It goes as far as all of the runs have come.
+    It ends where the shortest run does.
     """
     frames, mean, _ = mean_line([mean_curve(runs, metric)[:2] for runs in tasks])
     return frames, mean
 
 
 def compared(results: Results, rows: Sequence[Average]) -> Figure | None:
-    """Draw a line for each row, by groups; None if in none of them a task is everywhere.
+    """Draw a line for each row, a panel for each group; None if no group has a shared task.
 
-    Lines over different tasks would tell of the tasks, so only those count that a whole group has.
+    Only tasks that all rows of a group have count; otherwise the lines would compare tasks.
     """
     shade, panels = shades(rows), {}
     for group, own in by_group(rows).items():
@@ -60,14 +60,13 @@ def compared(results: Results, rows: Sequence[Average]) -> Figure | None:
                 Line(row.name, [found[task] for task in tasks], _style(row, shade[row.setting]))
                 for row, found in zip(own, runs, strict=True)
             ]
-            count = _count(tasks)
-            many = f"the {count} that all have" if len(own) > 1 else count
-            panels[_title(group, f"mean of {many}")] = lines
+            kind = "shared task" if len(own) > 1 else "task"
+            panels[_title(group, f"mean of {_count(tasks, kind)}")] = lines
     return _drawn(panels)
 
 
 def apart(results: Results, rows: Sequence[Average]) -> set[str]:
-    """Return the groups whose rows share no task, which is why they have no curve."""
+    """Return the groups that have no curve because their rows share no task."""
     return {
         group
         for group, own in by_group(rows).items()
@@ -77,7 +76,7 @@ def apart(results: Results, rows: Sequence[Average]) -> set[str]:
 
 
 def validated(results: Results, rows: Sequence[Average]) -> Figure | None:
-    """Draw the mean over each row's tasks, and of each seed that has them all, thin."""
+    """Draw the mean over each row's tasks, and thin lines for seeds that have all of them."""
     panels = {}
     for row in rows:
         tasks = list(_runs(results, row).values())
@@ -96,7 +95,7 @@ def validated(results: Results, rows: Sequence[Average]) -> Figure | None:
 def _runs(results: Results, row: Average) -> dict[str, list[Run]]:
     """Return the runs of each of a row's tasks that have a curve.
 
-    Finished ones, or where there are none those that may go on.
+    These are the finished runs, or if there are none, all that have not failed.
     """
     found = {}
     for task in results.tasks:
@@ -111,7 +110,7 @@ def _runs(results: Results, row: Average) -> dict[str, list[Run]]:
 
 
 def _shared(each: Sequence[Collection[str]]) -> list[str]:
-    """Return the tasks that all have."""
+    """Return the tasks that occur in every collection."""
     return [task for task in each[0] if all(task in others for others in each)]
 
 
@@ -119,8 +118,8 @@ def _style(row: Average, shade: Any) -> dict[str, Any]:
     return {"color": shade, "lw": 1.8, "ls": "-" if row.setting.with_pregrasp else "--"}
 
 
-def _count(tasks: Sequence[Any]) -> str:
-    return f"{len(tasks)} task{'s' if len(tasks) > 1 else ''}"
+def _count(tasks: Sequence[Any], kind: str = "task") -> str:
+    return f"{len(tasks)} {kind}{'s' if len(tasks) > 1 else ''}"
 
 
 def _title(group: str, text: str) -> str:
@@ -128,7 +127,7 @@ def _title(group: str, text: str) -> str:
 
 
 def _drawn(panels: Panels) -> Figure | None:
-    """Draw success and error over frames."""
+    """Draw success and error over frames, a pair of axes for each panel."""
     if not panels:
         return None
     styles = {line.name: line.style for lines in panels.values() for line in lines if line.name}
@@ -147,7 +146,7 @@ def _drawn(panels: Panels) -> Figure | None:
             axes.set_ylabel(name, fontsize=9)
             pair[0].set_title(title, loc="left", fontsize=9)
         end = axis_end(metric, most)
-        axes.set_ylim(-0.02 * end, end)  # the axis would hide a line at 0
+        axes.set_ylim(-0.02 * end, end)  # room for a line at 0
         few_ticks(axes.yaxis, 4)
     if styles:
         handles = [Line2D([], [], **style) for style in styles.values()]

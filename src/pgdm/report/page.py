@@ -1,4 +1,4 @@
-"""The report as one self-contained page, with its tables and pictures beside it."""
+"""The report: one self-contained page, with its tables and figures as files next to it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from pgdm.config.store import PAPER_FRAMES
+from pgdm.config.compose import PAPER_FRAMES
 from pgdm.errors import RunError
+from pgdm.library.progress import StepProgress, counted
 from pgdm.report import alike, export, figures, mean_curves, tables
 from pgdm.report.curves import curves
 from pgdm.report.results import Results, paper
 from pgdm.report.runs import ERROR, SUCCESS
 from pgdm.report.settings import shared
-from pgdm.report.source import Found, Progress, find
+from pgdm.report.source import Found, find
 from pgdm.report.statistics import DRAWS, Estimate
 from pgdm.report.task_table import task_rows
 
@@ -32,22 +33,22 @@ _NONE = "-"
 
 
 def write_report(
-    places: Sequence[str], out: Path, progress: Progress, uri: str | None = None
+    places: Sequence[str], out: Path, progress: StepProgress, uri: str | None = None
 ) -> tuple[Path, Results]:
     """Write the report on the runs of some folders and MLflow experiments.
 
     Args:
-        places: folders, or names of experiments.
-        out: folder to write into; made if it is missing.
-        progress: told how far it is.
-        uri: the MLflow store; None is the one in the folder of runs.
+        places: folders, or names of MLflow experiments.
+        out: folder to write to; created if missing.
+        progress: reports each step.
+        uri: MLflow store; None: the one in the folder of runs.
 
     Returns:
-        The page, and the runs on it.
+        The page, and its runs.
 
     Raises:
-        RunError: if there are no runs that can be read, or the folder cannot be written.
-        TrackingError: if there is no such experiment.
+        RunError: if no run can be read, or the folder cannot be written.
+        TrackingError: if there is no such MLflow experiment.
     """
     found = find(places, uri, out, progress)
     if not found.runs:
@@ -64,7 +65,7 @@ def write_report(
 
 
 def _context(
-    results: Results, found: Found, places: Sequence[str], out: Path, progress: Progress
+    results: Results, found: Found, places: Sequence[str], out: Path, progress: StepProgress
 ) -> dict[str, Any]:
     by_task = {setting: task_rows(results, setting) for setting in results.settings}
     progress("computing statistics", 0, 1)
@@ -119,9 +120,9 @@ def _pictures(
     averages: Mapping[str, Sequence[tables.Average]],
     aggregates: export.Aggregates,
     out: Path,
-    progress: Progress,
+    progress: StepProgress,
 ) -> dict[str, Any]:
-    """Draw everything; the page gets names and pictures as data addresses."""
+    """Draw all figures; return name to figure, or to figures by task, as data URLs."""
     found: dict[str, Any] = {}
     if any(len(run.evaluations["frames"]) for run in results.runs):
         for name, metric in (("curves", SUCCESS), ("curves_error", ERROR)):
@@ -149,11 +150,10 @@ def _pictures(
     return found
 
 
-def _films(results: Results, out: Path, progress: Progress) -> list[dict[str, Any]]:
-    """Return the films, each with a small picture; the first of each task and setting leads."""
+def _films(results: Results, out: Path, progress: StepProgress) -> list[dict[str, Any]]:
+    """Return the videos, each with a thumbnail; the first of each task and setting leads."""
     found, seen = [], set()
-    for number, run in enumerate(results.runs):
-        progress("shrinking pictures", number, len(results.runs))
+    for run in counted("reading posters", results.runs, progress):
         small = run.video and figures.thumbnail(run.video.with_suffix(".png"))
         if run.video and small:
             address = quote(os.path.relpath(run.video, out.absolute()))
@@ -165,7 +165,7 @@ def _films(results: Results, out: Path, progress: Progress) -> list[dict[str, An
 
 
 def _provenance(results: Results) -> list[tuple[str, list[tuple[str, int]]]]:
-    """Return what the runs were made with: a fact, and each of its values with its runs."""
+    """Return versions and assets behind the runs: fact, and its values with numbers of runs."""
     facts: dict[str, Counter[str]] = {}
     for run in results.runs:
         of_run = {
@@ -173,6 +173,7 @@ def _provenance(results: Results) -> list[tuple[str, list[tuple[str, int]]]]:
             "assets": run.result.get("asset_source"),
             "start": run.result.get("pregrasp_used"),
             "expert hand": run.result.get("expert_hand"),
+            "engine of the training": run.result.get("engine", "C MuJoCo, float64"),
             **run.result.get("versions", {}),
         }
         for name, value in of_run.items():
@@ -182,7 +183,7 @@ def _provenance(results: Results) -> list[tuple[str, list[tuple[str, int]]]]:
 
 
 def _commands(results: Results) -> list[str]:
-    """Return what makes these runs again, one command a setting."""
+    """Return the commands that reproduce the runs, one per setting."""
     found = []
     for setting in results.settings:
         tasks = [task for task in results.tasks if results.cell(setting, task)]
@@ -219,7 +220,7 @@ def _shown(value: float, form: str) -> str:
 
 
 def _between(estimate: Estimate, form: str = ".1%") -> str:
-    """Return an interval; empty where there is none."""
+    """Return an interval as text; empty if there is none."""
     if math.isnan(estimate.low):
         return ""
     return f"[{estimate.low:{form}}, {estimate.high:{form}}]"

@@ -1,4 +1,4 @@
-"""All runs of a report in their places: setting by task by seed."""
+"""All runs of a report, by setting, task and seed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @cache
 def paper() -> dict[str, Any]:
-    """Return what the paper states, and what doing nothing gives: ``paper.yaml``."""
+    """Return ``paper.yaml``: the paper's averages, and the success of doing nothing."""
     text = resources.files("pgdm.report").joinpath("paper.yaml").read_text(encoding="utf-8")
     return yaml.safe_load(text)
 
@@ -29,13 +29,13 @@ class Results:
     """The runs of a report.
 
     Args:
-        runs: all of them; of several with equal setting, task and seed one counts, which is the
-            finished, longest, newest one.
+        runs: all of them; of several with equal setting, task and seed only one counts: a finished
+            one first, then the longest, then the latest.
     """
 
     def __init__(self, runs: Sequence[Run]) -> None:
         best: dict[tuple[Setting, str, int], Run] = {}
-        for run in sorted(runs, key=_worth):
+        for run in sorted(runs, key=lambda run: (run.finished, run.frames, run.modified)):
             best[run.setting, run.task, run.seed] = run
         kept = {run.path for run in best.values()}
         self.doubles = [run for run in runs if run.path not in kept]
@@ -50,7 +50,7 @@ class Results:
             self._cells.setdefault((run.setting, run.task), []).append(run)
 
     def cell(self, setting: Setting, task: str) -> list[Run]:
-        """Return the runs of a setting on a task, by seed, in whatever state they are."""
+        """Return the runs of a setting on a task by seed, in any state."""
         return self._cells.get((setting, task), [])
 
     def seeds(self, setting: Setting) -> list[int]:
@@ -58,7 +58,7 @@ class Results:
         return sorted({run.seed for run in self.runs if run.setting == setting})
 
     def states(self, setting: Setting, task: str) -> dict[int, str]:
-        """Return the state of each seed that the setting has on any task."""
+        """Return the state on a task of each seed that the setting has on any task."""
         there = {run.seed: run.state for run in self.cell(setting, task)}
         return {seed: there.get(seed, "missing") for seed in self.seeds(setting)}
 
@@ -68,7 +68,7 @@ class Results:
         metric: str = SUCCESS,
         wanted: Callable[[Run], bool] = lambda run: True,
     ) -> dict[str, Array]:
-        """Return a metric of the finished runs of a setting: task to one number a run."""
+        """Return a metric of the finished runs of a setting: task to one value per run."""
         found = {}
         for task in self.tasks:
             runs = [run for run in self.cell(setting, task) if run.finished and wanted(run)]
@@ -78,15 +78,16 @@ class Results:
         return found
 
     def deviations(self, setting: Setting, *groups: str) -> list[str]:
-        """Return why a setting's results cannot be set against the paper's.
+        """Return why a setting's results are not comparable with the paper's; empty if they are.
 
         Args:
-            groups: config groups in which the paper's own table differs in the same way.
+            setting: the setting.
+            groups: config groups that the paper's own table varies too.
         """
         found = setting.deviations(*groups)
-        asked = setting.option("pregrasp")
-        starts = Counter(r.start for r in self.runs if r.setting == setting and r.start != asked)
-        return found + [f"start {start}, not {asked}: {n} runs" for start, n in starts.items()]
+        wanted = setting.option("pregrasp")
+        starts = Counter(r.start for r in self.runs if r.setting == setting and r.start != wanted)
+        return found + [f"start {start}, not {wanted}: {n} runs" for start, n in starts.items()]
 
     def counts(self) -> dict[str, int]:
         """Return how many runs are in each state."""
@@ -95,7 +96,7 @@ class Results:
 
 
 def known(run: Run, key: str) -> float:
-    """Return a figure of the paper for a run's task; NaN if it reports none."""
+    """Return the paper's value for a run's task; NaN if it reports none."""
     value = run.facts.get(key)
     return float(value) if isinstance(value, int | float) else np.nan
 
@@ -104,7 +105,3 @@ def average(values: Iterable[float]) -> float:
     """Return the mean of the finite values; NaN if there are none."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else np.nan
-
-
-def _worth(run: Run) -> tuple[bool, int, float]:
-    return run.finished, run.frames, run.modified

@@ -1,4 +1,4 @@
-"""What the report needs of each run, read from its folder once."""
+"""A run as the report needs it, read once from its folder."""
 
 from __future__ import annotations
 
@@ -12,20 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pgdm.report.settings import Setting, setting_of
-from pgdm.tracking.run_folder import ENDED_BY, TIME_LIMIT, RunFolder
-from pgdm.tracking.run_log import Record, metrics_of
+from pgdm.runs.files import VIDEOS
+from pgdm.runs.folder import RunFolder
+from pgdm.runs.log import Record, metrics_of
+from pgdm.runs.result import ENDED_BY, TIME_LIMIT
 
 SUCCESS = "eval_sampled/success"
-"""The paper's success: actions are sampled."""
+"""Success with sampled actions, as in the paper."""
 SUCCESS_MEAN = "eval_deterministic/success"
-"""The same with the policy's mean action."""
+"""Success with the mean action."""
 ERROR = "eval_sampled/com_error_released"
 ROTATION = "eval_sampled/ori_error"
 LIFTED = "eval_sampled/lifted"
 FINGERTIPS = "eval_sampled/hand_error_m"
-"""How far fingertips are from the expert's; only methods that follow one record it."""
+"""Distance of the fingertips from the expert's; only methods that follow an expert record it."""
 CONTACTS = "eval_sampled/contact_distance_m"
-"""The same of its contact points."""
+"""Distance of the fingertips from the expert's contact points."""
 METRICS = (
     SUCCESS,
     SUCCESS_MEAN,
@@ -39,10 +41,10 @@ METRICS = (
 )
 RETURN = "train/return"
 MISSING = "missing"
-"""State of a run that was planned and has not begun."""
+"""State of a run that a sweep has planned but not started."""
 STATES = ("finished", "running", "interrupted", "failed", MISSING)
 TRAIN_POINTS = 100
-"""Points of a run's training curve, about."""
+"""Approximate number of points of a curve of training."""
 
 Curve = dict[str, NDArray[np.float64]]
 
@@ -56,26 +58,26 @@ class Run:
     state: str
     """One of ``STATES``."""
     setting: Setting
-    """Everything of it but task and seed."""
+    """Everything but task and seed."""
     task: str
     seed: int
     frames: int
     """Environment steps done."""
     budget: str
     facts: Mapping[str, Any]
-    """Of the task, from the configuration: ``paper_success``, ``pregrasp_source``, ``tcdm30``..."""
+    """Facts about the task, from the configuration: ``paper_success``, ``pregrasp_source``..."""
     result: Mapping[str, Any]
-    """``result.json``; empty if the run has not ended in good order."""
+    """``result.json``; empty if the run has not written it."""
     metrics: Mapping[str, float]
-    """Of the last evaluation; what is not finite is left out."""
+    """Metrics of the last evaluation; values that are not finite are left out."""
     evaluations: Curve
-    """``frames`` and each of ``METRICS``, all (E,)."""
+    """``frames`` and each of ``METRICS``, (E,) each."""
     training: Curve
     """``frames`` and ``RETURN``, (about TRAIN_POINTS,)."""
     video: Path | None
-    """The last film; its poster lies beside it, as PNG."""
+    """The last video; its poster is the PNG of the same name."""
     modified: float
-    """When it last wrote something, s since the epoch."""
+    """Time of the last write, s since the epoch."""
 
     def metric(self, name: str) -> float:
         """Return a metric of the last evaluation; NaN if there is none."""
@@ -83,12 +85,12 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Whether the run came to its end; only such runs count in averages."""
+        """Whether the run is finished; only finished runs count in averages."""
         return self.state == "finished"
 
     @property
     def start(self) -> str:
-        """Where its episodes started: the source asked for, or the one that was there instead."""
+        """Source of the start that was used: the requested one, or its fallback."""
         return str(self.result.get("pregrasp_used", self.setting.option("pregrasp")))
 
 
@@ -110,12 +112,12 @@ def read_run(folder: RunFolder) -> Run:
         metrics=dict(stored) or (metrics_of(evaluations[-1]) if evaluations else {}),
         evaluations=_curve(evaluations, METRICS),
         training=_curve(trained, (RETURN,)),
-        video=max((folder.path / "videos").glob("frames_*.mp4"), default=None),
+        video=max((folder.path / VIDEOS).glob("frames_*.mp4"), default=None),
     )
 
 
 def planned_run(folder: RunFolder) -> Run:
-    """Return a run that has only a configuration yet."""
+    """Return a run that so far has only a configuration."""
     empty = {"frames": 0, "metrics": {}, "video": None}
     return _run(folder, state=MISSING, evaluations=_curve((), METRICS), training={}, **empty)
 

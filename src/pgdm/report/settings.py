@@ -1,4 +1,4 @@
-"""What a run was made with besides task and seed: how it differs from the paper's settings."""
+"""A run's configuration, all but task and seed, as deviations from the paper's settings."""
 
 from __future__ import annotations
 
@@ -9,36 +9,23 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+from pgdm.config.compose import PAPER_FRAMES, compose_plain
 from pgdm.config.describe import describe
-from pgdm.config.groups import available, conf_dir
+from pgdm.config.groups import GROUPS, available, conf_dir
 from pgdm.config.identity import changes_result
-from pgdm.config.store import PAPER_FRAMES, compose_plain
-from pgdm.config.strict import flatten
-
-# Config group -> the key in which a configuration keeps the name of the option that was chosen.
-GROUPS = {
-    "method": "method.name",
-    "ablation": "ablation.name",
-    "pregrasp": "pregrasp.source",
-    "action": "action.kind",
-    "algo": "algo.name",
-    "shaping": "shaping.name",
-    "obs": "obs.layout",
-    "reference": "reference.frame",
-    "hand": "hand.name",
-}
+from pgdm.runs.config_file import dotted
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Runs with the same setting differ in task and seed only."""
+    """All that runs share which differ in task and seed only."""
 
     options: tuple[tuple[str, str], ...]
-    """Config group and chosen option; without the hand, where it is the task's own."""
+    """Config group and chosen option; without the hand if it is the task's own."""
     changes: tuple[str, ...]
-    """Overrides that make it from pgdm's defaults, which are the paper's settings."""
+    """Overrides of pgdm's defaults, which are the paper's settings."""
     total_frames: int
-    """Length of the training, environment steps."""
+    """Length of the training in frames."""
 
     def option(self, group: str) -> str:
         """Return the option of a group."""
@@ -56,28 +43,28 @@ class Setting:
 
     @property
     def plain(self) -> bool:
-        """Whether it is the paper's own method as it stands, which its figures of tasks are of."""
+        """Whether it is the paper's own method, to which its values by task belong."""
         return self.method == "pgdm" and self.option("ablation") == "none" and self.with_pregrasp
 
     @property
     def own_hand(self) -> bool:
-        """Whether each task has the hand that it is for, as in the paper."""
+        """Whether each task has its own hand, as in the paper."""
         return not self.within("hand")
 
     def within(self, *groups: str) -> tuple[str, ...]:
-        """Return its changes that belong to some config groups."""
+        """Return the changes within some config groups."""
         return tuple(c for c in self.changes if re.split("[.=]", c)[0] in groups)
 
     def rest(self, *groups: str) -> tuple[str, ...]:
-        """Return its changes and its length, without what belongs to some config groups."""
+        """Return the changes outside some config groups, and the length."""
         own = self.within(*groups)
         return *(c for c in self.changes if c not in own), f"{self.total_frames:,} frames"
 
     def deviations(self, *groups: str) -> list[str]:
-        """Return why its results cannot be set against the paper's; empty if they can.
+        """Return why its results are not comparable with the paper's; empty if they are.
 
         Args:
-            groups: those in which the paper's own table differs in the same way.
+            groups: config groups that the paper's own table varies too.
         """
         frames = self.total_frames
         fewer = [f"{frames:,} of {PAPER_FRAMES:,} frames"] if frames < PAPER_FRAMES else []
@@ -88,13 +75,13 @@ def setting_of(config: Mapping[str, Any], out_of_time: bool = False) -> Setting:
     """Return the setting of a run's configuration.
 
     Args:
-        config: as plain containers.
-        out_of_time: whether its limit of time ended it; it is then a setting like others, so that
-            the run is not averaged with those that had all their frames.
+        config: configuration as plain containers.
+        out_of_time: whether the time limit stopped the run; the limit then counts as a change, so
+            that the run is not averaged with those that trained for all their frames.
     """
     flat = {
         key: value
-        for key, value in flatten(config).items()
+        for key, value in dotted(config).items()
         if changes_result(key) and key not in ("seed", "format") and not key.startswith("task.")
     }
     task = config.get("task")
@@ -120,14 +107,14 @@ def setting_of(config: Mapping[str, Any], out_of_time: bool = False) -> Setting:
 
 
 def shared(settings: Sequence[Setting]) -> tuple[str, ...]:
-    """Return the changes that several settings have in common, but for the method's name."""
+    """Return the changes that several settings have in common, except the method's name."""
     first, *others = settings
     common = (c for c in first.changes if all(c in other.changes for other in others))
     return tuple(c for c in common if others and not c.startswith("method="))
 
 
 def labels(settings: Sequence[Setting]) -> dict[Setting, str]:
-    """Return short names that tell settings apart: what all have in common is left out."""
+    """Return short names that distinguish settings, without what all have in common."""
     common = shared(settings)
     lengths = {s.total_frames for s in settings}
     found = {}
@@ -142,12 +129,12 @@ def labels(settings: Sequence[Setting]) -> dict[Setting, str]:
 
 @cache
 def _composed(options: frozenset[tuple[str, str]]) -> dict[str, Any]:
-    return flatten(compose_plain([f"{group}={option}" for group, option in sorted(options)]))
+    return dotted(compose_plain([f"{group}={option}" for group, option in sorted(options)]))
 
 
 @cache
 def _hand_of(task: str) -> str | None:
-    """Return the hand that a task is for; None if it is not one of pgdm's."""
+    """Return the hand of one of pgdm's tasks; None for other tasks."""
     file = conf_dir() / "task" / f"{task}.yaml"
     if not task or not file.is_file():
         return None

@@ -1,66 +1,64 @@
-"""Where runs come from: folders, which are the truth, or an MLflow experiment."""
+"""Find runs: in folders, which are authoritative, or in an MLflow experiment."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from pgdm import paths
+from pgdm import files, paths
 from pgdm.errors import RunError, TrackingError
+from pgdm.library.progress import StepProgress, counted
 from pgdm.report.runs import METRICS, RETURN, Run, planned_run, read_run
-from pgdm.tracking.mlflow import STATUS, connect, sqlite_file, store_uri
-from pgdm.tracking.run_folder import (
-    ARTIFACTS,
+from pgdm.runs.files import (
     CONFIG,
-    FACTS,
+    CONFIG_KINDS,
+    LOG,
     RESULT,
-    RunFolder,
-    find_runs,
+    VIDEOS,
+    fault,
     read_json,
     write_json,
 )
-from pgdm.tracking.run_log import FILE_NAME
+from pgdm.runs.folder import ARTIFACTS, FACTS, RunFolder, find_runs
+from pgdm.tracking.mlflow import STATUS, connect, one_line_errors, sqlite_file, store_uri
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Run as MlflowRun
 
 PLAN = "plan.json"
-"""What a sweep keeps of its jobs, in its folder."""
+"""File of a sweep's folder that lists its jobs."""
 _PAGE = 1000
-
-Progress = Callable[[str, int, int], None]
-"""Told what is done now, how many of it are done, and of how many."""
 
 
 @dataclass
 class Found:
-    """What there is to report on."""
+    """The runs to report on."""
 
     runs: list[Run] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
     """Folder to reason."""
     commands: list[str] = field(default_factory=list)
-    """What was typed to start the sweeps, where that is known."""
+    """Commands that started the sweeps, if known."""
 
 
-def find(places: Sequence[str], uri: str | None, out: Path, progress: Progress) -> Found:
+def find(places: Sequence[str], uri: str | None, out: Path, progress: StepProgress) -> Found:
     """Read all runs of some folders and MLflow experiments.
 
     Args:
-        places: folders, or names of experiments.
-        uri: the MLflow store; None is the one in the folder of runs.
-        out: where to put what MLflow has of runs whose folders are not here.
-        progress: told how far it is.
+        places: folders, or names of MLflow experiments.
+        uri: MLflow store; None: the one in the folder of runs.
+        out: folder for MLflow's copies of runs whose own folders are not here.
+        progress: reports the runs read.
 
     Raises:
-        RunError: if there are none.
-        TrackingError: if there is no such experiment.
+        RunError: if there are no runs.
+        TrackingError: if there is no such MLflow experiment.
     """
     found, folders = Found(), {}
     for place in places:
@@ -69,8 +67,7 @@ def find(places: Sequence[str], uri: str | None, out: Path, progress: Progress) 
         else:
             here = _of_experiment(place, uri or store_uri(paths.runs()), out, progress)
         folders |= {folder.path: folder for folder in here if folder.path not in folders}
-    for number, folder in enumerate(folders.values()):
-        progress("reading runs", number, len(folders))
+    for folder in counted("reading runs", folders.values(), progress):
         try:
             begun = (folder.path / CONFIG).exists()
             found.runs.append(read_run(folder) if begun else planned_run(folder))
@@ -85,28 +82,42 @@ def find(places: Sequence[str], uri: str | None, out: Path, progress: Progress) 
 
 
 def _planned(root: Path, found: Found) -> Iterator[RunFolder]:
-    """Return the runs of the sweeps in a folder, those that have not begun included."""
-    for file in sorted(root.rglob(PLAN)):
+    """Return the runs of the sweeps in a folder, including those that have not started."""
+    for file in sorted(Path(f, PLAN) for f, _, names in files.walk(root) if PLAN in names):
         plan = read_json(file)
         found.commands += [str(plan["command"])] if plan.get("command") else []
-        for config in (job["config"] for job in plan.get("jobs", []) if "config" in job):
-            folder = RunFolder(file.parent / config["run_dir"])
+        jobs = plan.get("jobs", [])
+        for job in jobs if isinstance(jobs, list) else [jobs]:
+            if isinstance(job, dict) and "config" not in job:
+                continue
+            config = job["config"] if isinstance(job, dict) else None
+            if not isinstance(config, dict) or fault(config, {**CONFIG_KINDS, "run_dir": (str,)}):
+                found.unreadable[str(file)] = "it is damaged; the sweep's command plans it anew"
+                continue
+            folder = RunFolder(file.parent / config.get("run_dir", ""))
             if not (folder.path / CONFIG).exists():
                 folder.config = config
             yield folder
 
 
-def _of_experiment(name: str, uri: str, out: Path, progress: Progress) -> list[RunFolder]:
-    """Return the runs of an experiment: their own folders, or else what MLflow has of them."""
-    file = sqlite_file(uri)
-    if file is not None and not file.exists():
-        raise RunError(
-            f"there is no folder '{name}', and no MLflow store {file} to look for an experiment "
-            "of that name; name a folder of runs, or the store with --uri"
-        )
-    from mlflow.exceptions import MlflowException
+def check_place(name: str, uri: str | None) -> None:
+    """Check that a place is a folder, or that there is an MLflow store to look for it in.
 
-    try:
+    Raises:
+        RunError: if there is neither.
+    """
+    file = sqlite_file(uri or store_uri(paths.runs()))
+    if not Path(name).is_dir() and file is not None and not file.exists():
+        raise RunError(
+            f"there is no folder '{name}', and no MLflow store {file} to look for an MLflow "
+            "experiment of that name; name a folder of runs, or the store with --uri"
+        )
+
+
+def _of_experiment(name: str, uri: str, out: Path, progress: StepProgress) -> list[RunFolder]:
+    """Return the runs of an MLflow experiment: their own folders, or copies from MLflow."""
+    check_place(name, uri)
+    with one_line_errors(f"MLflow at {uri}"):
         client = connect(uri)
         experiment = client.get_experiment_by_name(name)
         if experiment is None:
@@ -116,15 +127,12 @@ def _of_experiment(name: str, uri: str, out: Path, progress: Progress) -> list[R
             )
         runs = list(_all_runs(client, experiment.experiment_id))
         folders = []
-        for number, run in enumerate(runs):
-            progress("asking MLflow", number, len(runs))
+        for run in counted("asking MLflow", runs, progress):
             tags, own = run.data.tags, RunFolder(Path(run.data.tags["run_dir"]))
-            # A folder of that name may be of another run, made on another machine.
+            # A folder of that name may belong to another run, from another machine.
             mine = tags.items() >= own.origin().items() or own.link.get("run_id") == run.info.run_id
             here = mine and (own.path / CONFIG).exists()
             folders.append(own if here else RunFolder(_copied(client, run, out / ARTIFACTS)))
-    except MlflowException as error:
-        raise TrackingError(f"MLflow at {uri}: {str(error).splitlines()[0]}") from error
     return folders
 
 
@@ -142,8 +150,9 @@ def _all_runs(client: MlflowClient, experiment_id: str) -> Iterator[MlflowRun]:
 
 
 def _copied(client: MlflowClient, run: MlflowRun, place: Path) -> Path:
-    """Write what MLflow has of a run as a run folder."""
-    folder, run_id = place / run.info.run_id, run.info.run_id
+    """Write MLflow's copy of a run as a run folder."""
+    run_id = run.info.run_id
+    folder = paths.inside(place, run_id, kind=f"the run id of {run.info.run_name!r} in MLflow")
     folder.mkdir(parents=True, exist_ok=True)
     now = {key[4:]: text for key, text in run.data.tags.items() if key.startswith("now.")}
     config = _nested({**run.data.params, **now})
@@ -155,31 +164,33 @@ def _copied(client: MlflowClient, run: MlflowRun, place: Path) -> Path:
             header = {"frames": entry.step, "iteration": 0, "time_s": 0.0, "kind": kind}
             lines.setdefault((kind, entry.step), header)[name] = entry.value
     text = "".join(json.dumps(lines[key]) + "\n" for key in sorted(lines))
-    (folder / FILE_NAME).write_text(text)
+    (folder / LOG).write_text(text)
     status = next((ours for ours, theirs in STATUS.items() if theirs == run.info.status), "failed")
     (folder / RESULT).unlink(missing_ok=True)
     if status != "running":
         frames = max((step for _, step in lines), default=0)
         facts = {fact: run.data.tags[fact] for fact in FACTS if fact in run.data.tags}
         write_json(folder / RESULT, {"status": status, "frames": frames, **facts})
-    (folder / "videos").mkdir(exist_ok=True)
-    last = sorted(artifact.path for artifact in client.list_artifacts(run_id, "videos"))[-2:]
+    (folder / VIDEOS).mkdir(exist_ok=True)
+    last = sorted(artifact.path for artifact in client.list_artifacts(run_id, VIDEOS))[-2:]
     for film in last:  # and its poster, which has its name
+        paths.inside(Path(), *Path(film).parts, kind="a file in MLflow")
         there = Path(client.download_artifacts(run_id, film, str(folder)))
-        there.replace(folder / "videos" / there.name)
+        there.replace(folder / VIDEOS / there.name)
     return folder
 
 
 def _nested(flat: Mapping[str, str]) -> dict[str, Any]:
-    """Return settings as ``run_folder.flatten`` had them before."""
+    """Undo `pgdm.runs.config_file.dotted`."""
     nested: dict[str, Any] = {}
     for key, text in flat.items():
         *parents, last = key.split(".")
         inner = nested
         for parent in parents:
-            inner = inner.setdefault(parent, {})
+            below = inner.setdefault(parent, {})
+            inner = below if isinstance(below, dict) else {}  # a key that is no section, too
         try:
-            inner[last] = json.loads(text)
+            inner[last] = files.parse_json(text.encode())
         except ValueError:
             inner[last] = text
     return nested

@@ -1,8 +1,8 @@
 """Statistics over few runs of many tasks, as Agarwal et al. define them.
 
 "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021: interquartile
-mean, stratified bootstrap, performance profile (section 4.2), probability of improvement (4.3).
-Scores are given as one array a task, with one number a run; tasks may differ in their runs.
+mean, stratified bootstrap, performance profile (Sec. 4.2), probability of improvement (Sec. 4.3).
+Scores are an array x_m for each task m = 1..M, with a value x_mn for each of its N_m runs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LEVEL = 0.95
 
 
 class Estimate(NamedTuple):
-    """A number and its confidence interval; NaN bounds where no task has two runs."""
+    """A value and its confidence interval; the bounds are NaN if no task has two runs."""
 
     value: float
     low: float
@@ -29,17 +29,17 @@ class Estimate(NamedTuple):
 
 
 def interquartile_mean(values: Array) -> Array:
-    """Return the mean of the middle half along the last axis; a quarter is cut off each end."""
+    """Return the mean of the sorted values n//4 < k <= n - n//4 along the last axis (n,)."""
     size = values.shape[-1]
     cut = size // 4
     return np.sort(values, axis=-1)[..., cut : size - cut].mean(axis=-1)
 
 
 def resampled(scores: Scores, rng: np.random.Generator, draws: int = DRAWS) -> list[Array]:
-    """Return ``draws`` stratified bootstrap samples: each task's runs drawn anew from its own.
+    """Return stratified bootstrap samples: each task's runs are resampled with replacement.
 
     Returns:
-        One array a task, (draws, runs of the task).
+        An array for each task, (draws, N_m).
     """
     return [task[rng.integers(len(task), size=(draws, len(task)))] for task in scores]
 
@@ -52,14 +52,14 @@ def iqm(scores: Scores, seed: int = 0) -> Estimate:
 
 
 def mean(scores: Scores, seed: int = 0) -> Estimate:
-    """Return the mean over tasks of each task's mean over its runs, as the paper averages."""
+    """Return the paper's average, 1/M sum_m 1/N_m sum_n x_mn."""
     drawn = resampled(scores, np.random.default_rng(seed))
     value = float(np.mean([task.mean() for task in scores]))
     return _estimate(value, np.mean([task.mean(axis=-1) for task in drawn], axis=0), scores)
 
 
 def profile(scores: Scores, thresholds: Array, seed: int = 0) -> list[Estimate]:
-    """Return for each threshold the share of runs that score above it; all tasks weigh the same."""
+    """Return the share of runs above each threshold t, F(t) = 1/M sum_m 1/N_m sum_n [x_mn > t]."""
     drawn = resampled(scores, np.random.default_rng(seed))
 
     def share(tasks: Scores, threshold: float) -> Array:
@@ -69,9 +69,10 @@ def profile(scores: Scores, thresholds: Array, seed: int = 0) -> list[Estimate]:
 
 
 def improvement(x: Scores, y: Scores, seed: int = 0) -> Estimate:
-    """Return the probability that a run of ``x`` beats one of ``y`` on a task drawn at random.
+    """Return the probability that a run of ``x`` beats one of ``y`` on a random task.
 
-    Ties count half. Both have the same tasks in the same order.
+    1/M sum_m 1/(N_m K_m) sum_n sum_k ([x_mn > y_mk] + [x_mn = y_mk] / 2), for the same tasks in
+    the same order.
     """
     rng = np.random.default_rng(seed)
     drawn = zip(resampled(x, rng), resampled(y, rng), strict=True)
@@ -80,13 +81,13 @@ def improvement(x: Scores, y: Scores, seed: int = 0) -> Estimate:
 
 
 def _beats(a: Array, b: Array) -> Array:
-    """Return the share of pairs in which ``a`` is larger, over the last axis of each."""
+    """Return the share of pairs in which ``a`` is larger, ties as halves, over the last axes."""
     left, right = a[..., :, None], b[..., None, :]
     return ((left > right) + 0.5 * (left == right)).mean(axis=(-2, -1))
 
 
 def _estimate(value: float, drawn: Array, scores: Scores) -> Estimate:
     if max(len(task) for task in scores) < 2:
-        return Estimate(value, np.nan, np.nan)  # drawing one of one says nothing about chance
+        return Estimate(value, np.nan, np.nan)  # a single run has no spread to resample
     low, high = np.quantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Estimate(value, float(low), float(high))

@@ -1,4 +1,4 @@
-"""The report's tables of averages, set beside those of the paper."""
+"""The report's tables of averages, compared with those of the paper."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from pgdm.report.statistics import Estimate
 NOTHING = Estimate(np.nan, np.nan, np.nan)
 _WITH, _WITHOUT = " with pre-grasp", " without pre-grasp"
 THRESHOLDS = np.linspace(0.0, 1.0, 51)
-"""Of the performance profile, in success."""
+"""Thresholds of the performance profile, in success."""
 
 
 @dataclass(frozen=True)
 class Average:
-    """One setting over several tasks: the mean of the tasks' means."""
+    """A setting's mean over several tasks, each of them a mean over runs."""
 
     table: str
     """``source``, ``ablation`` or ``baseline``."""
@@ -31,64 +31,66 @@ class Average:
     name: str
     """Row of the table: source of pre-grasps, ablation, or method."""
     group: str
-    """What its setting differs in besides; only rows of one group compare. Empty: all do."""
+    """How its setting differs otherwise; only rows with equal groups are comparable. Empty if no
+    row differs."""
     wanted: Callable[[Run], bool]
-    """Tells the runs on the tasks that it is of."""
+    """Whether a run is on one of its tasks."""
     tasks: tuple[str, ...]
-    """Those on which a run has finished."""
+    """Tasks with a finished run."""
     runs: int
     success: Estimate
     error: Estimate
     rotation: Estimate
     same: dict[str, float]
-    """The paper's figures of the same tasks, averaged: ``success`` and ``com_error``; NaN where
-    the row is not what they are of, PGDM as it stands."""
+    """The paper's average over the same tasks: ``success`` and ``com_error``; NaN unless the row is
+    PGDM with pre-grasps and no ablation, to which the paper's values by task belong."""
     paper: dict[str, float] = field(default_factory=dict)
-    """The paper's own average: ``success``, ``com_error``, and ``tasks`` where it says so; empty
-    where the row is none of the paper's: another method's ablation, other values, another hand."""
+    """The paper's own average: ``success``, ``com_error``, and ``tasks`` if stated; empty if the
+    paper has no such row: another method's ablation, other values, another hand."""
     deviations: tuple[str, ...] = ()
-    """Why it cannot be set against the paper's."""
+    """Why it is not comparable with the paper."""
 
     @property
     def hue(self) -> str:
-        """What has one hue in all groups: its name, whether with or without pre-grasps."""
+        """Key for its colour, shared by all groups and by the rows with and without pre-grasp."""
         return self.name.replace(_WITHOUT, _WITH)
 
 
 class Improvement(NamedTuple):
-    """How a setting fares against another one on the tasks that both have."""
+    """Comparison of a setting with another one on their shared tasks."""
 
     chance: Estimate
+    """Probability that a run of the setting beats one of the other on a random shared task."""
     tasks: int
     runs: int
-    """The setting's on these tasks."""
+    """Runs of the setting on these tasks."""
     than_runs: int
-    """The other one's."""
+    """Runs of the other one."""
 
     @property
     def single(self) -> bool:
-        """Whether each has one run a task, so that tasks are counted and nothing is probable."""
+        """Whether both have a single run per task: then tasks are counted."""
         return self.runs == self.than_runs == self.tasks
 
     @property
     def won(self) -> float:
-        """Tasks on which the setting is better, ties as halves, if it is ``single``."""
+        """If ``single``: number of tasks on which the setting is better, ties as halves."""
         return self.chance.value * self.tasks
 
 
 def by_source(results: Results) -> list[Average]:
-    """Return Table I: each setting with the plain method and pre-grasps, by their source."""
+    """Return Table I: each setting of PGDM with pre-grasps and no ablation, by their source."""
     rows = []
     for setting in results.settings:
         if setting.plain:
-            for source, figures in paper()["by_source"].items():
+            for source, stated in paper()["by_source"].items():
                 group = results.labels[setting] if len(results.settings) > 1 else ""
-                rows += _average(results, "source", setting, source, group, figures, _from(source))
+                rows += _average(results, "source", setting, source, group, stated, _from(source))
     return rows
 
 
 def by_ablation(results: Results) -> list[Average]:
-    """Return the ablations on tcdm30, and what each would be without; empty if there are none."""
+    """Return the ablations on tcdm30, each with its unablated setting; empty if there are none."""
     ablated = [s for s in results.settings if s.option("ablation") != "none"]
     rests = {setting.rest("ablation") for setting in ablated}
     shown = [setting for setting in results.settings if setting.rest("ablation") in rests]
@@ -97,14 +99,14 @@ def by_ablation(results: Results) -> list[Average]:
     for setting in shown:
         name, values = setting.option("ablation"), _values(setting, "ablation")
         own = setting.method == "pgdm" and not values
-        figures = paper()["by_ablation"].get(name, {}) if own else {}
-        args = results, "ablation", setting, name + values, groups[setting], figures, _in_tcdm30
+        stated = paper()["by_ablation"].get(name, {}) if own else {}
+        args = results, "ablation", setting, name + values, groups[setting], stated, _in_tcdm30
         rows += _average(*args, "ablation")
     return rows
 
 
 def baselines(results: Results) -> list[Average]:
-    """Return methods with and without pre-grasps on tcdm30; empty if there is only one kind."""
+    """Return methods with and without pre-grasps on tcdm30; empty if there is only one row."""
     settings = [s for s in results.settings if s.option("ablation") == "none"]
     if len({(s.method, s.with_pregrasp) for s in settings}) < 2:
         return []
@@ -112,17 +114,17 @@ def baselines(results: Results) -> list[Average]:
     groups = _groups(settings, "method", "pregrasp")
     rows = []
     for setting, same in kinds.items():
-        figures = paper()["by_ablation"]["none"] if setting.plain else {}
+        stated = paper()["by_ablation"]["none"] if setting.plain else {}
         name = setting.method + (_WITH if setting.with_pregrasp else _WITHOUT)
         name += _values(setting, "method")
         name += "".join(f", {c}" for c in setting.within("pregrasp") if c != "pregrasp=none")
-        args = results, "baseline", setting, name, groups[setting], figures, _in_tcdm30
+        args = results, "baseline", setting, name, groups[setting], stated, _in_tcdm30
         rows += _average(*args, *same)
     return rows
 
 
 def by_group(rows: Iterable[Average]) -> dict[str, list[Average]]:
-    """Return the rows that compare with one another, by what their settings differ in besides."""
+    """Return the rows by group; only rows of one group are comparable."""
     found: dict[str, list[Average]] = {}
     for row in rows:
         found.setdefault(row.group, []).append(row)
@@ -130,7 +132,7 @@ def by_group(rows: Iterable[Average]) -> dict[str, list[Average]]:
 
 
 def aggregates(results: Results) -> dict[Setting, tuple[Estimate, list[Estimate], int, int]]:
-    """Return for each setting: interquartile mean, profile, tasks, runs; where any has finished."""
+    """Return interquartile mean, profile, tasks and runs of each setting with a finished run."""
     found = {}
     for setting in results.settings:
         scores = list(results.scores(setting).values())
@@ -142,7 +144,7 @@ def aggregates(results: Results) -> dict[Setting, tuple[Estimate, list[Estimate]
 
 
 def improvements(results: Results) -> dict[tuple[Setting, Setting], Improvement]:
-    """Return for each two settings with shared tasks how the first fares against the second."""
+    """Compare each pair of settings that share tasks, the first with the second."""
     found = {}
     for a, b in combinations(results.settings, 2):
         x, y = results.scores(a), results.scores(b)
@@ -154,9 +156,9 @@ def improvements(results: Results) -> dict[tuple[Setting, Setting], Improvement]
     return found
 
 
-def _groups(settings: Sequence[Setting], *put_aside: str) -> dict[Setting, str]:
-    """Return what tells settings apart besides some config groups; all empty if nothing does."""
-    rests = {setting: setting.rest(*put_aside) for setting in settings}
+def _groups(settings: Sequence[Setting], *ignored: str) -> dict[Setting, str]:
+    """Return how settings differ outside some config groups; all empty if they do not."""
+    rests = {setting: setting.rest(*ignored) for setting in settings}
     if len(set(rests.values())) < 2:
         return dict.fromkeys(settings, "")
     shared = set.intersection(*map(set, rests.values()))
@@ -165,7 +167,7 @@ def _groups(settings: Sequence[Setting], *put_aside: str) -> dict[Setting, str]:
 
 
 def _values(setting: Setting, group: str) -> str:
-    """Return what a setting changes within a config group, as an end of a row's name."""
+    """Return a setting's changes within a config group, as a suffix of a row's name."""
     own = [c.split("=", 1) for c in setting.changes if c.startswith(f"{group}.")]
     return "".join(f", {key.rpartition('.')[2]}={value}" for key, value in own)
 
@@ -176,11 +178,11 @@ def _average(
     setting: Setting,
     name: str,
     group: str,
-    figures: dict[str, float],
+    stated: dict[str, float],
     wanted: Callable[[Run], bool],
-    *same: str,
+    *groups: str,
 ) -> Iterator[Average]:
-    """Give the row, if any run has finished."""
+    """Yield the row, if any run has finished."""
     scores = results.scores(setting, SUCCESS, wanted)
     if not scores:
         return
@@ -189,10 +191,10 @@ def _average(
         values = list(results.scores(setting, metric, wanted).values())
         return statistics.mean(values) if values else NOTHING
 
-    def stated(figure: str) -> float:
+    def same(key: str) -> float:
         first = [results.cell(setting, task)[0] for task in scores]
         own = setting.plain and setting.own_hand
-        return average(known(run, figure) for run in first) if own else np.nan
+        return average(known(run, key) for run in first) if own else np.nan
 
     yield Average(
         table=table,
@@ -205,14 +207,14 @@ def _average(
         success=estimate(SUCCESS),
         error=estimate(ERROR),
         rotation=estimate(ROTATION),
-        same={"success": stated("paper_success"), "com_error": stated("paper_com_error")},
-        paper=figures if setting.own_hand else {},
-        deviations=tuple(results.deviations(setting, *same)),
+        same={"success": same("paper_success"), "com_error": same("paper_com_error")},
+        paper=stated if setting.own_hand else {},
+        deviations=tuple(results.deviations(setting, *groups)),
     )
 
 
 def _from(source: str) -> Callable[[Run], bool]:
-    """Return what tells the tasks of a row of Table I; those beyond the paper's 50 are in none."""
+    """Return a test whether a run belongs to a row of Table I, of the paper's 50 tasks only."""
 
     def wanted(run: Run) -> bool:
         own = run.facts.get("pregrasp_source")

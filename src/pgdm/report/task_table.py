@@ -1,4 +1,4 @@
-"""The report's table of single tasks."""
+"""The report's table by task."""
 
 from __future__ import annotations
 
@@ -9,66 +9,66 @@ import numpy as np
 from pgdm.report.results import Results, average, known, paper
 from pgdm.report.runs import CONTACTS, ERROR, FINGERTIPS, LIFTED, SUCCESS, SUCCESS_MEAN, Run
 from pgdm.report.settings import Setting
-from pgdm.tracking.run_folder import WRIST_BOUND
+from pgdm.runs.result import WRIST_BOUND
 
 
 @dataclass(frozen=True)
 class TaskRow:
-    """One setting on one task; means over the seeds that finished."""
+    """A setting on a task; means over the finished seeds."""
 
     setting: Setting
     task: str
     source: str
-    """Where the task's pre-grasp came from."""
+    """Source of the task's pre-grasp in the paper."""
     seeds: dict[int, str]
     """Seed to state."""
     frames: int
-    """Fewest environment steps of a finished run; 0 if none has finished."""
+    """Frames of the shortest finished run; 0 if none has finished."""
     success: float
     success_mean_action: float
     error: float
     lifted: float
     fingertips: float
-    """Their mean distance from the expert's, m; NaN where no run recorded it."""
+    """Mean distance of the fingertips from the expert's, m; NaN if no run recorded it."""
     contacts: float
-    """That from its contact points."""
+    """Mean distance of the fingertips from the expert's contact points, m; NaN likewise."""
     paper_success: float
     paper_error: float
     null: float
     """Success if the object never moves."""
-    bound: float
-    """Success of the hand alone on its planned way; NaN where no wrist was planned."""
+    rigid_grasp: float
+    """Success that a grasp which never slips would reach; NaN without a wrist plan."""
     comparable: bool
-    """Whether the paper's figures were made the same way."""
+    """Whether the paper's values are comparable."""
 
     @property
     def difference(self) -> float:
-        """Success less the paper's."""
+        """Success minus the paper's."""
         return self.success - self.paper_success
 
     @property
     def follows(self) -> bool:
-        """Whether it is known how far the hand was from the expert's."""
+        """Whether distances from the expert's hand are known."""
         return bool(np.isfinite([self.fingertips, self.contacts]).any())
 
     @property
     def planned(self) -> bool:
-        """Whether the bound is known."""
-        return bool(np.isfinite(self.bound))
+        """Whether ``rigid_grasp`` is known."""
+        return bool(np.isfinite(self.rigid_grasp))
 
     @property
     def idle(self) -> bool:
-        """Whether doing nothing is as good; its success is known to four digits."""
+        """Whether doing nothing is as good, to the four digits of its known success."""
         return round(self.success, 4) <= self.null
 
     @property
     def done(self) -> int:
-        """How many seeds have finished."""
+        """Number of finished seeds."""
         return sum(state == "finished" for state in self.seeds.values())
 
 
 def task_rows(results: Results, setting: Setting) -> list[TaskRow]:
-    """Return the table of one setting, a row a task."""
+    """Return the table of a setting, a row for each task."""
     rows = []
     comparable = not results.deviations(setting)
     for task in results.tasks:
@@ -96,7 +96,7 @@ def task_rows(results: Results, setting: Setting) -> list[TaskRow]:
                 paper_success=known(runs[0], "paper_success"),
                 paper_error=known(runs[0], "paper_com_error"),
                 null=paper()["null_policy"].get(task, np.nan),
-                bound=average(float(run.result.get(WRIST_BOUND, np.nan)) for run in done),
+                rigid_grasp=average(float(run.result.get(WRIST_BOUND, np.nan)) for run in done),
                 comparable=comparable,
             )
         )

@@ -1,1 +1,1 @@
-"""Learning: collect, learn, evaluate, checkpoint; knows neither MuJoCo nor methods."""
+"""Learning: collect, learn, evaluate, save; depends on neither MuJoCo nor the methods."""

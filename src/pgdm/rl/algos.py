@@ -1,4 +1,4 @@
-"""The learners there are, by the name in ``algo.learner``."""
+"""All learners, by their name in ``algo.learner``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from pgdm.errors import UnknownNameError
+from pgdm.errors import check_name
 from pgdm.rl.learner import AlgoCfg, Learner
 from pgdm.rl.ppo import PPOCfg, PPOLearner, build_model
 from pgdm.rl.sac import SACCfg, SACLearner
@@ -17,13 +17,12 @@ ALGOS: dict[str, type[AlgoCfg]] = {"ppo": PPOCfg, "sac": SACCfg}
 
 
 def algo_class(name: str) -> type[AlgoCfg]:
-    """Return the class of a learner's settings.
+    """Return the settings class of a learner.
 
     Raises:
-        UnknownNameError: if there is no such learner.
+        UnknownNameError: if no learner has this name.
     """
-    if name not in ALGOS:
-        raise UnknownNameError("algo.learner", name, ALGOS)
+    check_name("algo.learner", name, ALGOS)
     return ALGOS[name]
 
 
@@ -39,17 +38,17 @@ def build_learner(
     """Return a new learner for an environment.
 
     Args:
-        env: what its policy acts in.
+        env: environment that its policy acts in.
         cfg: its settings.
         seed: the run's seed.
         total_frames: length of the training.
         device: where the networks are.
-        num_threads: threads of torch; 0: as many as torch takes by itself.
-        replay_folder: where an off-policy learner keeps what it saw, or None for in memory.
+        num_threads: threads of torch; 0: torch's default.
+        replay_folder: where an off-policy learner stores its replay, or None to keep it in memory.
 
     Raises:
         ConfigError: if the settings do not fit the number of simulations.
-        RunError: if there is no room for the replay.
+        RunError: if the disk has no room for the replay.
     """
     cfg.check(env.num_envs)
     threads = num_threads or torch.get_num_threads()

@@ -1,4 +1,4 @@
-"""Moments of a training that others can listen to."""
+"""Events of a training run that callbacks receive."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a training has come."""
+    """How far a training run is."""
 
     frames: int
-    """Environment steps so far, all simulations together."""
+    """Environment steps so far, summed over all simulations."""
     total_frames: int
-    """Where it ends."""
+    """Environment steps after which the training is finished."""
     iteration: int
     """Iterations (collect and learn) so far."""
     elapsed_s: float
-    """Time spent on the training, s, all attempts together."""
+    """Time spent on the training, s, summed over all attempts."""
 
 
 class Callback:
-    """Does nothing at each moment; override those of interest."""
+    """Does nothing on any event; override those of interest."""
 
     def on_start(self, trainer: Trainer) -> None:
-        """Before the first step, of a fresh training or of one that goes on."""
+        """Before the first step of a new or resumed training."""
 
     def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
         """After each iteration, with its ``train/`` metrics."""
@@ -40,4 +40,4 @@ class Callback:
         """After each checkpoint file."""
 
     def on_end(self, progress: Progress, status: str) -> None:
-        """Last of all; status is ``finished``, ``interrupted`` or ``failed``."""
+        """At the very end; status is ``finished``, ``interrupted`` or ``failed``."""

@@ -1,18 +1,19 @@
-"""Checkpoint files: written whole or not at all, checked when read, never able to run code."""
+"""Checkpoint files: written atomically, verified when read, never able to run code."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import logging
-import pickle
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from pgdm import files
 from pgdm.errors import CheckpointError
 from pgdm.paths import TEMPORARY, replacing
 
@@ -27,19 +28,26 @@ State = dict[str, Any]
 
 @dataclass(frozen=True)
 class CheckpointCfg:
-    """What a stopped run goes on from."""
+    """How often a run saves the state it can be resumed from."""
 
     interval_s: float
     """Time between two checkpoints, s."""
     keep_last: int
-    """Checkpoints kept, the newest ones; the best is kept besides."""
+    """Number of newest checkpoints that are kept, in addition to the best one."""
+
+
+Check = Callable[[State], object]
+
+
+def _any(state: State) -> None:
+    """Accept a state as it is."""
 
 
 class CheckpointFolder:
-    """The checkpoints of one run: the last few, and the best.
+    """The checkpoints of one run: the newest few, and the best.
 
     Args:
-        folder: where they are; made when the first one is written.
+        folder: where they are; created with the first one.
         keep_last: how many of the newest are kept.
     """
 
@@ -48,7 +56,7 @@ class CheckpointFolder:
 
     @property
     def best(self) -> Path:
-        """File of the best policy so far; it may not exist yet."""
+        """File of the policy with the highest success, then return, so far; may not exist yet."""
         return self.folder / _BEST
 
     def all(self) -> list[Path]:
@@ -56,10 +64,10 @@ class CheckpointFolder:
         return sorted(self.folder.glob("frames_*.ckpt"))
 
     def save(self, state: State, frames: int) -> Path:
-        """Write the state reached after ``frames``, then drop the oldest beyond ``keep_last``.
+        """Write the state after ``frames`` steps, then delete the oldest beyond ``keep_last``.
 
         Raises:
-            CheckpointError: if it cannot be written; those already there are untouched.
+            CheckpointError: if it cannot be written; earlier ones are untouched.
         """
         path = self.folder / f"frames_{frames:012d}.ckpt"
         write_checkpoint(path, state)
@@ -76,26 +84,30 @@ class CheckpointFolder:
         write_checkpoint(self.best, state)
         return self.best
 
-    def latest(self) -> State | None:
-        """Return the newest state that can be read, or None if there is no checkpoint."""
-        found = self.newest()
+    def latest(self, check: Check = _any) -> State | None:
+        """Return the newest usable state, or None if there is no checkpoint; see ``newest``."""
+        found = self.newest(check)
         return None if found is None else found[1]
 
-    def newest(self) -> tuple[Path, State] | None:
-        """Return the newest checkpoint that can be read and its state, or None if there is none.
+    def newest(self, check: Check = _any) -> tuple[Path, State] | None:
+        """Return the newest usable checkpoint and its state, or None if there is no checkpoint.
 
-        A damaged file is passed over for the one before it, with a warning, and renamed so that
-        it does not count among the last ones when others are dropped.
+        One that cannot be used is skipped in favour of the one before it, with a warning, and
+        renamed so that it is not counted among those to keep.
+
+        Args:
+            check: raises CheckpointError if a state cannot be used.
 
         Raises:
-            CheckpointError: if there are checkpoints but none can be read.
+            CheckpointError: if there are checkpoints but none can be used.
         """
         paths, damaged, reason = self.all(), [], ""
         for path in reversed(paths):
             try:
                 state = read_checkpoint(path)
+                check(state)
             except CheckpointError as error:
-                _log.warning("%s; going on from the one before", error)
+                _log.warning("%s: %s; resuming from the one before", path.name, error)
                 damaged.append(path)
                 reason = str(error)
                 continue
@@ -104,7 +116,7 @@ class CheckpointFolder:
             return path, state
         if paths:
             raise CheckpointError(
-                f"none of the {len(paths)} checkpoints in {self.folder} can be read ({reason}); "
+                f"none of the {len(paths)} checkpoints in {self.folder} can be used ({reason}); "
                 "start anew in another run_dir"
             )
         return None
@@ -113,16 +125,16 @@ class CheckpointFolder:
 def write_checkpoint(path: Path, state: State) -> None:
     """Write tensors and plain containers to a file, atomically.
 
-    Whoever looks sees the old file or the whole new one, also after a loss of power.
+    The path always holds the old or the complete new file, also after a power failure.
 
     Raises:
-        CheckpointError: if the file cannot be written, or could not be read back because ``state``
-            holds something else than tensors and plain values.
+        CheckpointError: if the file cannot be written, or ``state`` holds anything other than
+            tensors and plain values, which could not be read back.
     """
     payload = _encode(state)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for stale in path.parent.glob(f"{TEMPORARY}*"):  # left behind by a process that was killed
+        for stale in path.parent.glob(f"{TEMPORARY}*"):  # of a process that was killed
             stale.unlink(missing_ok=True)
         with replacing(path) as temp, open(temp, "wb") as file:
             file.write(payload)
@@ -140,22 +152,21 @@ def read_checkpoint(path: Path) -> State:
 
     Raises:
         CheckpointError: if the file is missing, damaged, or holds more than tensors and plain
-            values (nothing in it is ever run).
+            values (nothing in it is ever executed).
     """
     try:
-        raw = path.read_bytes()
+        raw = files.read_bytes(path)
     except OSError as error:
-        raise CheckpointError(f"cannot read checkpoint {path}: {error.strerror}") from error
+        raise CheckpointError(f"cannot read checkpoint {path}: {files.reason(error)}") from error
     payload, footer = raw[:-_FOOTER_SIZE], raw[-_FOOTER_SIZE:]
     if not footer.startswith(_MAGIC):
-        raise CheckpointError(f"{path} is no checkpoint of pgdm, or is cut off ({len(raw)} bytes)")
+        raise CheckpointError(f"{path} is not a pgdm checkpoint, or is cut off ({len(raw)} bytes)")
     if footer[len(_MAGIC) :] != hashlib.sha256(payload).digest():
-        raise CheckpointError(f"checkpoint {path} is damaged: its checksum does not fit")
+        raise CheckpointError(f"checkpoint {path} is damaged: its checksum does not match")
     try:
-        state = torch.load(io.BytesIO(payload), map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise CheckpointError(f"checkpoint {path} is refused: {reason}") from error
+        state = files.parse_tensors(payload)
+    except ValueError as error:
+        raise CheckpointError(f"checkpoint {path} is refused: {error}") from error
     if not isinstance(state, dict):
         raise CheckpointError(f"checkpoint {path} holds a {type(state).__name__}, not a state")
     return state
@@ -165,11 +176,11 @@ def _encode(state: State) -> bytes:
     buffer = io.BytesIO()
     torch.save(state, buffer)
     try:
-        # What cannot be loaded must be found out now, not when the run is to be resumed.
-        torch.load(io.BytesIO(buffer.getbuffer()), weights_only=True)
-    except pickle.UnpicklingError as error:
+        # A state that cannot be loaded must fail now, not when the run is resumed.
+        files.parse_tensors(buffer.getvalue())
+    except ValueError as error:
         raise CheckpointError(
-            f"the state holds more than tensors and plain values: {str(error).splitlines()[0]}"
+            f"the state holds more than tensors and plain values: {error}"
         ) from error
     return buffer.getvalue()
 

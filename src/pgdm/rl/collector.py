@@ -1,210 +1,216 @@
-"""Acting in the environment and keeping what happened."""
+"""Acting in an environment: a TorchRL collector that can be saved and restored bit-exactly."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+import warnings
+from collections import OrderedDict
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.weight_update.weight_sync_schemes import WeightStrategy
 
-from pgdm.errors import RunError
-from pgdm.rl.vec_env import Finished, VecEnv
+from pgdm.errors import ConfigError, RunError
+from pgdm.rl.torch_state import Aside, drawing_from, torch_threads
+from pgdm.rl.vec_env import FinishedEpisodes, VecEnv
+from pgdm.seeding import torch_stream
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)  # about TorchRL's own classes
+    from torchrl.collectors import BaseCollector
 
 if TYPE_CHECKING:
     from pgdm.rl.learner import Learner
 
-
-T = TypeVar("T")
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use ``count`` threads inside.
-
-    While simulations step, torch gets one: its helper threads keep a core spinning for about
-    4 ms after each call (libgomp), which the simulation's own threads need.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+_STREAM = "actions"
 
 
-class Aside:
-    """Work that may go on in a second thread, with one thread of torch.
+class RolloutCollector(BaseCollector):
+    """Steps N simulations with a policy and yields one rollout of T steps after the other.
+
+    TorchRL's own collectors sample actions from torch's global random stream and cannot save where
+    the simulations are. This one samples from its own stream, and its ``state_dict`` is complete:
+    a collector restored from it continues bit-exactly.
+
+    A rollout is a new TensorDict of batch size [N, T] on the environment's device. It holds
+    ``observation`` (N, T, D), the policy's outputs, such as ``action`` (N, T, A), and under
+    ``next``: ``observation`` (after an episode's last step the one before the restart), ``reward``,
+    ``terminated``, ``truncated`` and ``done``, each (N, T, 1), ``raw_terms`` {name: (N, T)}, the
+    reward terms before weighting, and ``discount`` (N, T, 1) if the environment has one.
 
     Args:
-        name: of the thread.
-        wanted: whether there is one; if not, work is done when its result is asked for.
-    """
+        env: the simulations; finished ones restart automatically. They are reset here.
+        policy: reads ``observation`` (N, D), writes ``action`` (N, A). It is not copied, so a
+            training loop that changes its weights in place needs no `update_policy_weights_`.
+        frames_per_batch: N * T, environment steps in a rollout.
+        total_frames: environment steps after which iteration stops, with a complete rollout;
+            -1: never.
+        seed: seed of the action noise.
+        learner: trained alongside: works during each step, and sees each step right after it.
 
-    def __init__(self, name: str, wanted: bool) -> None:
-        self._pool = None
-        if wanted:
-            one = {"initializer": torch.set_num_threads, "initargs": (1,)}
-            self._pool = ThreadPoolExecutor(1, name, **one)
-
-    def __call__(self, work: Callable[[], T]) -> Callable[[], T]:
-        """Start work; call what is returned for its result."""
-        return work if self._pool is None else self._pool.submit(work).result
-
-
-@dataclass(frozen=True)
-class Step:
-    """One control step of N simulations."""
-
-    obs: Tensor
-    """(N, D) observations that were acted upon."""
-    action: Tensor
-    """(N, A) actions as sampled."""
-    terminated: Tensor
-    """(N,) bool, nothing came after."""
-    truncated: Tensor
-    """(N,) bool, the episode was cut."""
-    info: dict[str, Any]
-    """As the environment gave it: ``final_obs``, ``raw_terms`` and more."""
-
-
-@dataclass
-class Rollout:
-    """T steps of N simulations. The tensors are reused by the next iteration."""
-
-    obs: Tensor
-    """(T + 1, N, D) observations as the environment gave them; the last are those to go on from."""
-    action: Tensor
-    """(T, N, A) actions as sampled."""
-    mean: Tensor
-    """(T, N, A) the policy's means that they were sampled around."""
-    reward: Tensor
-    """(T, N) rewards."""
-    terminated: Tensor
-    """(T, N) bool, nothing came after."""
-    truncated: Tensor
-    """(T, N) bool, the episode was cut."""
-    discount: Tensor | None = None
-    """(T, N) in [0, 1], by how much what comes after the step counts less, besides gamma."""
-    last_obs: list[tuple[int, Tensor, Tensor]] = field(default_factory=list)
-    """Of each step with truncated rows: t, the rows (k,), their true last observations (k, D)."""
-    finished: list[Finished] = field(default_factory=list)
-    """Episodes that finished, one entry a step."""
-
-    @classmethod
-    def empty(cls, steps: int, env: VecEnv) -> Rollout:
-        """Return room for ``steps`` steps of an environment."""
-        n = env.num_envs
-        return cls(
-            obs=torch.zeros(steps + 1, n, env.obs_dim),
-            action=torch.zeros(steps, n, env.action_dim),
-            mean=torch.zeros(steps, n, env.action_dim),
-            reward=torch.zeros(steps, n),
-            terminated=torch.zeros(steps, n, dtype=torch.bool),
-            truncated=torch.zeros(steps, n, dtype=torch.bool),
-        )
-
-    def metrics(self) -> dict[str, float]:
-        """Return the mean reward of a step, and the means over the finished episodes, if any.
-
-        An episode in which a metric does not apply has NaN, and is left out of its mean.
-        """
-        count = int((self.terminated | self.truncated).sum())
-        metrics = {"reward": float(self.reward.mean()), "episodes": float(count)}
-        if not self.finished:
-            return metrics
-        episodes = self.finished[0].with_later(self.finished[1:]).metrics()
-        return metrics | {
-            name: float(values.double().nanmean()) for name, values in episodes.items()
-        }
-
-
-class Collector:
-    """Steps the environment with a learner's policy and fills one rollout after the other.
-
-    Args:
-        env: the environment.
-        learner: whose policy acts; it may work beside each step and takes in what came of it.
-        steps: T, steps of each simulation in a rollout.
-        generator: stream of the action noise.
+    Raises:
+        ConfigError: if ``frames_per_batch`` is not a multiple of N.
     """
 
     def __init__(
-        self, env: VecEnv, learner: Learner, steps: int, generator: torch.Generator
+        self,
+        env: VecEnv,
+        policy: TensorDictModuleBase,
+        *,
+        frames_per_batch: int,
+        total_frames: int = -1,
+        seed: int = 0,
+        learner: Learner | None = None,
     ) -> None:
-        self.env, self.learner = env, learner
-        self.steps, self.generator = steps, generator
-        self._rollout = Rollout.empty(steps, env)
-        # The policy that acts never waits for the learner's work beside the step before: whether
-        # both really happen at the same time changes nothing but the speed.
-        self._aside = Aside("pgdm-physics", learner.overlaps)
-
-    @property
-    def frames(self) -> int:
-        """Environment steps in one rollout."""
-        return self.steps * self.env.num_envs
+        super().__init__()
+        if frames_per_batch % env.num_envs:
+            raise ConfigError(
+                f"frames_per_batch {frames_per_batch} is not a multiple of the {env.num_envs} "
+                "simulations"
+            )
+        self.env, self.policy, self.total_frames = env, policy, total_frames
+        self.frames_per_batch = self.requested_frames_per_batch = frames_per_batch
+        self.metrics: dict[str, float] = {}
+        """Last rollout's mean reward of a step, number of finished episodes, and their means."""
+        self._learner, self._frames = learner, 0
+        self._generator = torch_stream(seed, _STREAM)
+        # What the learner does during a step does not depend on the step's result, so whether the
+        # two really overlap changes nothing but the speed.
+        self._aside = Aside("pgdm-physics", learner is not None and learner.overlaps)
+        self.reset()
 
     def reset(self) -> None:
-        """Start all simulations afresh."""
-        self._rollout.obs[-1] = self.env.reset()
+        """Restart all simulations."""
+        self._obs = self.env.reset()
 
-    def collect(self) -> Rollout:
-        """Go on from where the last rollout ended, for ``steps`` steps.
+    def iterator(self) -> Iterator[TensorDict]:
+        """Yield rollouts until ``total_frames``.
 
         Raises:
-            RunError: if the environment gives a reward or an observation that is not finite.
+            RunError: if the environment returns a reward or observation that is not finite.
         """
-        rollout = self._rollout
-        rollout.obs[0] = rollout.obs[-1].clone()
-        rollout.last_obs, rollout.finished = [], []
+        while self.total_frames < 0 or self._frames < self.total_frames:
+            yield self.rollout()
+
+    def rollout(self) -> TensorDict:
+        """Take T steps from where the last rollout stopped; see the class.
+
+        Raises:
+            RunError: if the environment returns a reward or observation that is not finite.
+        """
+        if self.pre_collect_hook is not None:
+            self.pre_collect_hook()
+        finished: list[FinishedEpisodes] = []
         with torch_threads(1):
-            for t in range(self.steps):
-                self._step(rollout, t)
+            steps = range(self.frames_per_batch // self.env.num_envs)
+            by_time: Any = torch.stack([self._step(t, finished) for t in steps])
+        self._frames += self.frames_per_batch
+        self.metrics = _metrics(by_time, finished)
+        rollout = by_time.transpose(0, 1)
+        rollout.names = [None, "time"]
+        if self.post_collect_hook is not None:
+            self.post_collect_hook(rollout)
         return rollout
 
-    def _step(self, rollout: Rollout, t: int) -> None:
-        acted_on, action = rollout.obs[t], rollout.action[t]
-        rollout.action[t], rollout.mean[t] = self.learner.model.sample(acted_on, self.generator)
+    def _step(self, t: int, finished: list[FinishedEpisodes]) -> TensorDict:
+        """Take a control step; return it, [N], and note the episodes that finished in it."""
+        step = TensorDict({"observation": self._obs}, [self.env.num_envs], device=self.env.device)
+        random = set_exploration_type(ExplorationType.RANDOM)
+        with torch.no_grad(), random, drawing_from(self._generator):
+            step = self.policy(step)
+        action = step["action"]
         result = self._aside(lambda: self.env.step(action))
-        self.learner.during_step()
-        obs, reward, terminated, truncated, info = result()
-        rollout.obs[t + 1], rollout.reward[t] = obs, reward
-        rollout.terminated[t], rollout.truncated[t] = terminated, truncated
-        if (discount := info.get("discount")) is not None:
-            if rollout.discount is None:
-                rollout.discount = torch.ones_like(rollout.reward)
-            rollout.discount[t] = discount
+        if self._learner is not None:
+            self._learner.during_step()
+        self._obs, reward, terminated, truncated, info = result()
         # A sum is finite only if all its parts are, and costs a tenth of looking at each.
-        if not math.isfinite(float(reward.sum()) + float(obs.sum())):
-            _check_finite(t, obs, reward, info)
-        self.learner.after_step(Step(acted_on, action, terminated, truncated, info))
-        if truncated.any():
-            rows = truncated.nonzero()[:, 0]
-            rollout.last_obs.append((t, rows, info["final_obs"][rows].clone()))
-        if info["episodes"] is not None:
-            rollout.finished.append(info["episodes"])
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what the next rollout depends on, the policy aside."""
-        return {
-            "env": self.env.state_dict(),
-            "obs": self._rollout.obs[-1].clone(),
-            "generator": self.generator.get_state(),
+        if not math.isfinite(float(reward.sum()) + float(self._obs.sum())):
+            _check_finite(t, self._obs, reward, info)
+        step["next"] = {
+            "observation": info["final_obs"],
+            "reward": reward[:, None],
+            "terminated": terminated[:, None],
+            "truncated": truncated[:, None],
+            "done": (terminated | truncated)[:, None],
+            "raw_terms": info["raw_terms"],
         }
+        if (discount := info.get("discount")) is not None:
+            step["next", "discount"] = discount[:, None]
+        if info["episodes"] is not None:
+            finished.append(info["episodes"])
+        if self._learner is not None:
+            self._learner.after_step(step)
+        return step
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        """Restart the streams of the action noise and, if it has one, of the environment.
+
+        The simulations continue where they are. Returns the seed for the next collector: ``seed``
+        itself if ``static_seed``, else the next integer.
+        """
+        self._generator.set_state(torch_stream(seed, _STREAM).get_state())
+        if (reseed := getattr(self.env, "reseed", None)) is not None:
+            reseed(seed)
+        return seed if static_seed else seed + 1
+
+    def get_model(self, model_id: str) -> TensorDictModuleBase:
+        """Return the policy, the only model here, for TorchRL's weight synchronisation."""
+        if model_id != "policy":
+            raise KeyError(f"this collector has no model '{model_id}', only 'policy'")
+        return self.policy
+
+    def _maybe_fallback_update(
+        self, policy_or_weights: Any = None, *, model_id: str | None = None
+    ) -> None:
+        """Copy weights into the policy; without any there is nothing to do, it is shared."""
+        policy = self.get_model(model_id or "policy")
+        strategy = WeightStrategy()
+        if policy_or_weights is not None:
+            strategy.apply_weights(policy, strategy.extract_weights(policy_or_weights))
+
+    def state_dict(self) -> OrderedDict[str, Any]:
+        """Return all that the next rollout depends on, except the policy."""
+        return OrderedDict(
+            env=self.env.state_dict(),
+            obs=self._obs.cpu().clone(),
+            generator=self._generator.get_state(),
+            frames=self._frames,
+        )
+
+    def load_state_dict(self, state_dict: OrderedDict[str, Any]) -> None:
         """Continue from ``state_dict``."""
-        self.env.load_state_dict(state["env"])
-        self._rollout.obs[-1] = state["obs"]
-        self.generator.set_state(state["generator"])
+        self.env.load_state_dict(state_dict["env"])
+        self._obs = state_dict["obs"].to(self.env.device, copy=True)
+        self._generator.set_state(state_dict["generator"])
+        self._frames = state_dict["frames"]
+
+    def shutdown(
+        self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True
+    ) -> None:
+        """Stop the collector's thread, if it has one; simulations need no closing."""
+        self._aside.close()
+
+
+def _metrics(steps: TensorDict, finished: list[FinishedEpisodes]) -> dict[str, float]:
+    """Return a rollout's mean reward, its number of finished episodes, and their means.
+
+    An episode in which a metric does not apply has NaN, and is left out of its mean.
+    """
+    after: Any = steps["next"]
+    metrics = {"reward": float(after["reward"].mean()), "episodes": float(after["done"].sum())}
+    if not finished:
+        return metrics
+    episodes = finished[0].with_later(finished[1:]).metrics()
+    return metrics | {name: float(values.double().nanmean()) for name, values in episodes.items()}
 
 
 def _check_finite(t: int, obs: Tensor, reward: Tensor, info: dict[str, Any]) -> None:
-    """Raise an error that names the first bad number."""
+    """Raise an error that names the first value that is not finite."""
     terms = {f"reward term '{name}'": value for name, value in info.get("terms", {}).items()}
     for name, values in {**terms, "the reward": reward, "the observation": obs}.items():
         bad = (~torch.isfinite(values)).nonzero()

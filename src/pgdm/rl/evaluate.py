@@ -1,36 +1,36 @@
-"""Measuring a policy: whole episodes, sampled and deterministic, away from the training."""
+"""Evaluating a policy: whole episodes, sampled and deterministic, separate from the training."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from pgdm.errors import CheckpointError
-from pgdm.rl.checkpoint import read_checkpoint
-from pgdm.rl.collector import torch_threads
+from pgdm.rl.checkpoint import State
 from pgdm.rl.networks import ActorCritic, NetworkCfg, SquashedCfg, SquashedPolicy
+from pgdm.rl.torch_state import torch_threads
 from pgdm.rl.vec_env import VecEnv
 from pgdm.seeding import torch_stream
 
 
 @dataclass(frozen=True)
 class EvalCfg:
-    """How and how often a policy is measured."""
+    """How and how often a policy is evaluated."""
 
     episodes: int
     """Episodes of the sampled policy in one evaluation."""
     interval_frames: int
-    """Environment steps between two evaluations; 0: only at the start and the end."""
+    """Environment steps between two evaluations; 0: only before and after the training."""
     video: bool
     """Whether to record a video of the evaluated policy."""
     video_every_eval: bool
-    """Whether to record it at every evaluation, not only at the last."""
+    """Whether to record one at every evaluation instead of only the last."""
 
 
 class Policy(Protocol):
@@ -49,18 +49,18 @@ def run_episodes(
     generator: torch.Generator | None,
     stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Tensor] | None:
-    """Run one episode in each simulation, from a reset on.
+    """Run one episode in each simulation, starting with a reset.
 
-    Simulations that finish early go on, but only their first episode counts.
+    Simulations that finish early continue, but only their first episode counts.
 
     Args:
         env: the environment; all its simulations are restarted.
-        policy: who acts.
+        policy: the policy to evaluate.
         generator: stream of the action noise; None: the deterministic policy.
-        stop: asked before each step; True gives up.
+        stop: polled before each step; True abandons the evaluation.
 
     Returns:
-        Each metric's value (N,) in every simulation's episode, or None if it was stopped.
+        Each metric's values (N,), one per simulation, or None if it was stopped.
     """
     obs = env.reset()
     waiting = torch.ones(env.num_envs, dtype=torch.bool)
@@ -82,15 +82,17 @@ def run_episodes(
 
 
 class Evaluator:
-    """Measures a policy on simulations of its own.
+    """Evaluates a policy on simulations of its own.
 
     Every evaluation starts from the same state of the simulations and of the noise, so it depends
-    on the policy alone: a run that was stopped and resumed measures the same.
+    on the policy alone, also after a run was stopped and resumed.
 
     Args:
-        make_env: builds an environment of so many simulations; called once for each of the two.
+        make_env: builds an environment with the given number of simulations; called once for the
+            sampled and once for the deterministic policy.
         episodes: episodes of the sampled policy.
-        deterministic_episodes: of the deterministic one; 1 unless the task itself is random.
+        deterministic_episodes: episodes of the deterministic policy; 1 unless the task itself is
+            random.
         seed: the run's seed.
     """
 
@@ -114,8 +116,8 @@ class Evaluator:
     ) -> dict[str, float] | None:
         """Return ``eval_sampled/<metric>``, ``eval_deterministic/<metric>``, means over episodes.
 
-        Where there are several episodes, ``<metric>_std`` is their (sample) standard deviation.
-        None if ``stop`` said so.
+        With several episodes, ``<metric>_std`` is their sample standard deviation. None if it was
+        stopped.
         """
         metrics: dict[str, float] = {}
         for kind in self._episodes:
@@ -127,7 +129,7 @@ class Evaluator:
         return metrics
 
     def _fresh(self, kind: str) -> VecEnv:
-        """Return the environment of one kind as it was when new."""
+        """Return the environment of one kind in its initial state."""
         if kind not in self._envs:
             env = self._envs[kind] = self._make_env(self._episodes[kind])
             env.reset()
@@ -137,9 +139,9 @@ class Evaluator:
 
 
 def summarise(results: dict[str, Tensor], prefix: str = "") -> dict[str, float]:
-    """Return each metric's mean over its episodes (k,), and its spread where k > 1.
+    """Return each metric's mean over its episodes (k,), and its standard deviation if k > 1.
 
-    Episodes in which a metric does not apply have NaN, and are left out.
+    Episodes to which a metric does not apply have NaN, and are left out.
     """
     summary: dict[str, float] = {}
     for name, values in results.items():
@@ -150,22 +152,35 @@ def summarise(results: dict[str, Tensor], prefix: str = "") -> dict[str, float]:
     return summary
 
 
-def load_policy(path: Path) -> ActorCritic | SquashedPolicy:
-    """Return the policy of a checkpoint, on the CPU, with its observation statistics.
+def policy_of(state: State, path: Path) -> ActorCritic | SquashedPolicy:
+    """Return the policy in the contents of a checkpoint.
 
     Raises:
-        CheckpointError: if the file is missing, damaged or holds no policy.
+        CheckpointError: if they hold no policy; names the file.
     """
-    state = read_checkpoint(path)
     try:
-        network = state["network"]
-        squashed = "kind" in network  # an ActorCritic's says none
+        return network_of(state["network"], state["learner"]["model"])
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        reason = f"{type(error).__name__}: {error!s:.200}"
+        raise CheckpointError(f"{path} holds no policy of this version ({reason})") from error
+
+
+def network_of(
+    settings: Mapping[str, Any], weights: Mapping[str, Tensor]
+) -> ActorCritic | SquashedPolicy:
+    """Return a policy from its settings and its state dict; float16 weights become float32.
+
+    Raises:
+        LookupError, TypeError, ValueError, AttributeError, RuntimeError: if they do not fit.
+    """
+    with torch.device("meta"):  # no memory for sizes that only the settings name
+        squashed = "kind" in settings  # absent from the settings of an ActorCritic
         model = (
-            SquashedPolicy(SquashedCfg(**network))
+            SquashedPolicy(SquashedCfg(**settings))
             if squashed
-            else ActorCritic(NetworkCfg(**network))
+            else ActorCritic(NetworkCfg(**settings))
         )
-        model.load_state_dict(state["learner"]["model"])
-    except (KeyError, TypeError, RuntimeError) as error:
-        raise CheckpointError(f"{path} holds no policy of this version: {error}") from error
+    kinds = {name: value.dtype for name, value in model.state_dict().items()}
+    fitting = {name: value.to(kinds.get(name, value.dtype)) for name, value in weights.items()}
+    model.load_state_dict(fitting, assign=True)
     return model.eval()

@@ -1,15 +1,18 @@
-"""What the trainer asks of a learner: PPO and SAC differ behind it, and nowhere else."""
+"""What the trainer needs of a learner: PPO and SAC differ behind it, and nowhere else."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
 
-from pgdm.rl.collector import Rollout, Step
 from pgdm.rl.vec_env import VecEnv
+
+if TYPE_CHECKING:  # torchrl takes 2 s to import
+    from tensordict import TensorDict
 
 
 @dataclass(frozen=True)
@@ -17,9 +20,9 @@ class AlgoCfg:
     """Settings that every learner has."""
 
     usual_steps_per_s: ClassVar[float] = 1_000.0
-    """Environment steps a second, between two idle cores and two busy ones."""
+    """Typical speed on two cores, midway between idle and busy ones, frames per second."""
     usual_frame_bytes: ClassVar[int] = 0
-    """What each frame takes on the disk as long as a run goes on; about."""
+    """Disk space each frame needs until the run has finished, approximate."""
 
     learner: str
     """``ppo`` or ``sac``."""
@@ -32,7 +35,7 @@ class AlgoCfg:
     steps_per_env: int
     """T, control steps of each simulation in one iteration."""
     hidden: list[int]
-    """Widths of the hidden layers of each network."""
+    """Widths of the hidden layers, of each network."""
     log_std_init: float
     """Log of the policy's standard deviation at the start."""
     warm_start: bool
@@ -47,8 +50,20 @@ class AlgoCfg:
             ConfigError: with the values, if they do not fit.
         """
 
+    @property
+    def networks(self) -> int:
+        """How many networks of ``hidden`` layers learn."""
+        return 2
+
+    def memory_bytes(self, env: VecEnv, num_envs: int) -> int:
+        """Return the memory of a rollout and of the networks with Adam's averages, bytes."""
+        widths = [env.obs_dim, *self.hidden, env.action_dim]
+        weights = self.networks * sum(a * b for a, b in pairwise(widths))
+        frame = 2 * (env.obs_dim + env.action_dim)
+        return 4 * (4 * weights + num_envs * self.steps_per_env * frame)
+
     def disk_bytes(self, env: VecEnv, num_envs: int, total_frames: int) -> int:
-        """Return the bytes that a training of so many frames keeps on the disk as it goes."""
+        """Return the disk space that a run of so many frames needs while it runs, bytes."""
         return 0
 
 
@@ -57,10 +72,12 @@ class Model(Protocol):
 
     @property
     def cfg(self) -> Any:
-        """What it is built from, with ``as_dict()``."""
+        """Settings it is built from, a dataclass of plain values."""
         ...
 
-    def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def sample(
+        self, obs: Tensor, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Draw actions (N, A) at raw observations (N, D); return them and the policy's means."""
         ...
 
@@ -72,7 +89,7 @@ class Model(Protocol):
 
 
 class Learner(Protocol):
-    """Improves a policy from what it did."""
+    """Improves a policy from what it did, at three moments of an iteration."""
 
     @property
     def model(self) -> Model:
@@ -81,19 +98,19 @@ class Learner(Protocol):
 
     @property
     def overlaps(self) -> bool:
-        """Whether ``during_step`` has work that may go on beside the physics of a step."""
+        """Whether ``during_step`` may run in parallel with the physics."""
         ...
 
     def during_step(self) -> None:
-        """Work while the simulations take a step, with what was seen before it."""
+        """Work while the simulations take a step, on what was seen before it."""
         ...
 
-    def after_step(self, step: Step) -> None:
-        """Take in what a step led to."""
+    def after_step(self, step: TensorDict) -> None:
+        """Take in a step [N], with the keys of a rollout: see `RolloutCollector`."""
         ...
 
-    def learn(self, rollout: Rollout) -> dict[str, float]:
-        """Work after an iteration's last step; return what is logged.
+    def learn(self, rollout: TensorDict) -> dict[str, float]:
+        """Work after an iteration's last step, with its rollout [N, T]; return what is logged.
 
         Raises:
             RunError: if a loss or gradient is not finite; that step is then not taken.

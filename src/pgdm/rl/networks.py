@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from pgdm.errors import RunError
 from pgdm.rl.normalizer import Normalizer
@@ -18,59 +18,62 @@ _HIDDEN_GAIN, _MEAN_GAIN, _VALUE_GAIN = math.sqrt(2), 0.01, 1.0
 _NO_GENERATOR = "sampling an action needs a generator; pass one or deterministic=True"
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 _LOG_STD_RANGE = (-5.0, 1.0)  # of a squashed policy, before the squashing
-_WARM_START_LIMIT = 0.95  # beyond it tanh is so flat that nothing would be learned
+_WARM_START_LIMIT = 0.95  # beyond it tanh is too flat to learn
 
 
 @dataclass(frozen=True)
 class NetworkCfg:
-    """What is needed to build the networks that a checkpoint's weights fit into."""
+    """Settings to rebuild the networks of a checkpoint from."""
 
     obs_dim: int
     """D, numbers in an observation."""
     action_dim: int
     """A, numbers in an action."""
     hidden: list[int]
-    """Widths of the hidden layers, of each of the two networks."""
+    """Widths of the hidden layers, for both networks."""
     log_std_init: float
-    """Log of the policy's standard deviation at the start."""
+    """Log of the policy's initial standard deviation."""
     normalize_observations: bool
     """Whether observations are standardised by their running statistics."""
     observation_clip: float
     """Standardised observations are clipped here, standard deviations."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the settings as plain values."""
-        return asdict(self)
 
+class Gaussian(NamedTuple):
+    """N(loc, exp(log_std)^2) with independent entries, the same deviations in each row."""
 
-def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
-    """Return the log-density (M,) of actions (M, A) under N(mean (M, A), exp(log_std (A,)))."""
-    z = (action - mean) * torch.exp(-log_std)
-    return -0.5 * z.square().sum(-1) - log_std.sum() - log_std.numel() * _LOG_SQRT_2PI
+    loc: Tensor
+    """Means, (..., A)."""
+    log_std: Tensor
+    """Log of the standard deviations, (A,)."""
 
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log-density (...) of values (..., A)."""
+        z, count = (value - self.loc) * torch.exp(-self.log_std), self.log_std.numel()
+        return -0.5 * z.square().sum(-1) - self.log_std.sum() - count * _LOG_SQRT_2PI
 
-def gaussian_entropy(log_std: Tensor) -> Tensor:
-    """Return the entropy () of a Gaussian with independent entries, log_std (A,)."""
-    return log_std.sum() + log_std.numel() * (0.5 + _LOG_SQRT_2PI)
+    def entropy(self) -> Tensor:
+        """Return the entropy (), nat; it is the same in each row."""
+        return self.log_std.sum() + self.log_std.numel() * (0.5 + _LOG_SQRT_2PI)
 
 
 class ActorCritic(nn.Module):
     """A Gaussian policy with a free standard deviation, and a value function.
 
     Actions are neither squashed nor clipped: the environment clips, and the log-probability is
-    that of the action before (as stable-baselines3 does).
+    that of the unclipped action (as in stable-baselines3).
 
     Args:
-        cfg: sizes and start values.
+        cfg: sizes and initial values.
         generator: stream of the orthogonal initial weights; None leaves them uninitialised, for
             weights that are loaded afterwards.
-        mean_bias: start (A,) of the policy's mean, or None for 0.
+        mean_bias: initial mean (A,) of the policy, or None for 0.
     """
 
     def __init__(
         self,
         cfg: NetworkCfg,
-        generator: torch.Generator | None = None,
+        generator: Generator | None = None,
         mean_bias: Tensor | None = None,
     ) -> None:
         super().__init__()
@@ -92,48 +95,48 @@ class ActorCritic(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return self.log_std.device
 
     def normalize(self, obs: Tensor) -> Tensor:
-        """Return observations (..., D) as the networks want them."""
+        """Return observations (..., D) as the networks expect them."""
         return obs if self.normalizer is None else self.normalizer(obs)
-
-    def mean(self, normalized: Tensor) -> Tensor:
-        """Return the policy's mean (M, A) at normalised observations (M, D)."""
-        return self.policy(normalized)
 
     def value(self, normalized: Tensor) -> Tensor:
         """Return the discounted return (M,) expected from normalised observations (M, D)."""
         return self.critic(normalized).squeeze(-1)
 
+    def mean(self, obs: Tensor) -> Tensor:
+        """Return the policy's mean action (N, A) at raw observations (N, D)."""
+        return self.policy(self.normalize(obs))
+
     @torch.no_grad()
-    def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def sample(self, obs: Tensor, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
         """Draw actions (N, A) at raw observations (N, D); return them and the policy's means.
 
-        The noise is drawn on the generator's device, so that a run with its networks elsewhere
-        draws the same.
+        The noise is drawn on the CPU, so that a run with its networks elsewhere draws the same:
+        from ``generator``, or from torch's global stream.
         """
-        mean = self.mean(self.normalize(obs.to(self.device)))
+        mean = self.mean(obs.to(self.device))
         noise = torch.randn(mean.shape, generator=generator).to(self.device)
         return mean + self.log_std.exp() * noise, mean
 
     @torch.no_grad()
     def act(
-        self, obs: Tensor, generator: torch.Generator | None = None, deterministic: bool = False
+        self, obs: Tensor, generator: Generator | None = None, deterministic: bool = False
     ) -> Tensor:
         """Return actions (N, A) on the CPU for raw observations (N, D).
 
         Args:
-            obs: observations as the environment gives them.
+            obs: observations as the environment returns them.
             generator: stream of the noise; needed unless deterministic.
-            deterministic: the policy's mean instead of a sample.
+            deterministic: return the policy's mean instead of a sample.
 
         Raises:
             RunError: if a sample is wanted without a generator.
         """
         if deterministic:
-            return self.mean(self.normalize(obs.to(self.device))).cpu()
+            return self.mean(obs.to(self.device)).cpu()
         if generator is None:
             raise RunError(_NO_GENERATOR)
         return self.sample(obs, generator)[0].cpu()
@@ -141,10 +144,10 @@ class ActorCritic(nn.Module):
 
 @dataclass(frozen=True)
 class SquashedCfg:
-    """What is needed to build the policy that an off-policy checkpoint's weights fit into."""
+    """Settings to rebuild the policy of an off-policy checkpoint from."""
 
     kind: str
-    """``squashed``, which tells it from a ``NetworkCfg``."""
+    """``squashed``; distinguishes it from a ``NetworkCfg``."""
     obs_dim: int
     """D, numbers in an observation."""
     action_dim: int
@@ -152,28 +155,24 @@ class SquashedCfg:
     hidden: list[int]
     """Widths of the hidden layers."""
     log_std_init: float
-    """Log of the standard deviation at the start, before the squashing."""
+    """Log of the initial standard deviation, before the squashing."""
     observation_clip: float
     """Standardised observations are clipped here, standard deviations."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the settings as plain values."""
-        return asdict(self)
 
 
 class SquashedPolicy(nn.Module):
     """A Gaussian whose mean and deviation depend on the observation, squashed by tanh to (-1, 1).
 
     Args:
-        cfg: sizes and start values.
+        cfg: sizes and initial values.
         generator: stream of the initial weights; None leaves them uninitialised.
-        mean_bias: start (A,) of the squashed mean, or None for 0.
+        mean_bias: initial squashed mean (A,), or None for 0.
     """
 
     def __init__(
         self,
         cfg: SquashedCfg,
-        generator: torch.Generator | None = None,
+        generator: Generator | None = None,
         mean_bias: Tensor | None = None,
     ) -> None:
         super().__init__()
@@ -194,7 +193,7 @@ class SquashedPolicy(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return next(self.net.parameters()).device
 
     def forward(self, normalized: Tensor) -> tuple[Tensor, Tensor]:
@@ -202,34 +201,38 @@ class SquashedPolicy(nn.Module):
         mean, log_std = precise_end(self.net, normalized).chunk(2, -1)
         return mean, log_std.clamp(*_LOG_STD_RANGE).exp()
 
+    def mean(self, obs: Tensor) -> Tensor:
+        """Return the squashed mean (N, A) at raw observations (N, D)."""
+        return torch.tanh(self(self.normalizer(obs))[0])
+
     @torch.no_grad()
-    def sample(self, obs: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Draw actions (N, A) at raw observations (N, D); return them and the squashed means."""
+    def sample(self, obs: Tensor, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Draw actions (N, A); return them and the squashed means, see `ActorCritic.sample`."""
         mean, std = self(self.normalizer(obs.to(self.device)))
         noise = torch.randn(mean.shape, generator=generator).to(self.device)
         return torch.tanh(mean + std * noise), torch.tanh(mean)
 
     @torch.no_grad()
     def act(
-        self, obs: Tensor, generator: torch.Generator | None = None, deterministic: bool = False
+        self, obs: Tensor, generator: Generator | None = None, deterministic: bool = False
     ) -> Tensor:
         """Return actions (N, A) on the CPU for raw observations (N, D); see `ActorCritic.act`.
 
         Raises:
             RunError: if a sample is wanted without a generator.
         """
-        if generator is None and not deterministic:
+        if deterministic:
+            return self.mean(obs.to(self.device)).cpu()
+        if generator is None:
             raise RunError(_NO_GENERATOR)
-        if generator is None or deterministic:
-            return torch.tanh(self(self.normalizer(obs.to(self.device)))[0]).cpu()
         return self.sample(obs, generator)[0].cpu()
 
 
 class ActionValue(nn.Module):
-    """The discounted return (M, 1) expected after an action (M, A) at a normalised (M, D)."""
+    """The discounted return (M, 1) expected after actions (M, A) at normalised (M, D)."""
 
     def __init__(
-        self, obs_dim: int, action_dim: int, hidden: Sequence[int], generator: torch.Generator
+        self, obs_dim: int, action_dim: int, hidden: Sequence[int], generator: Generator
     ) -> None:
         super().__init__()
         self.net = silu_mlp(obs_dim + action_dim, hidden, 1, generator)
@@ -240,9 +243,9 @@ class ActionValue(nn.Module):
 
 
 def precise_end(net: nn.Sequential, inputs: Tensor) -> Tensor:
-    """Return a network's outputs, the last layer in float32 also under autocast.
+    """Return a network's outputs, with the last layer in float32 even under autocast.
 
-    It costs nothing, and in bfloat16 a value of 12 is rounded to 0.06.
+    It costs nothing, while bfloat16 would round a value of 12 to multiples of 0.06.
     """
     hidden = net[:-1](inputs)
     with torch.autocast(inputs.device.type, enabled=False):
@@ -250,7 +253,7 @@ def precise_end(net: nn.Sequential, inputs: Tensor) -> Tensor:
 
 
 def silu_mlp(
-    inputs: int, hidden: Sequence[int], outputs: int, generator: torch.Generator | None
+    inputs: int, hidden: Sequence[int], outputs: int, generator: Generator | None
 ) -> nn.Sequential:
     """Return hidden layers with layer norm and SiLU, weights uniform in +-1/sqrt(fan-in)."""
     layers: list[nn.Module] = []
@@ -275,11 +278,11 @@ def _mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
 
 
 def _linear(inputs: int, outputs: int) -> nn.Module:
-    # skip_init: torch's own start values would draw from the global stream.
+    # skip_init: torch's own initial values would be drawn from the global stream.
     return nn.utils.skip_init(nn.Linear, inputs, outputs)
 
 
-def _initialise(net: nn.Sequential, last_gain: float, generator: torch.Generator) -> None:
+def _initialise(net: nn.Sequential, last_gain: float, generator: Generator) -> None:
     layers = [layer for layer in net if isinstance(layer, nn.Linear)]
     for layer in layers:
         gain = last_gain if layer is layers[-1] else _HIDDEN_GAIN

@@ -5,16 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-_EPS = 1e-8
+EPS = 1e-8
 """Added to the variance, as stable-baselines3 does, so that constant entries become 0."""
 
 
 class Normalizer(nn.Module):
-    """Standardises observations by the mean and variance of all that it was shown.
+    """Standardises observations by the mean and variance of those it was updated with.
 
     Before the first ``update`` it only clips. Statistics change in ``update`` alone: the learner
-    calls it after the gradient steps of an iteration, so that the policy that acts and the policy
-    that learns see the same numbers.
+    calls it after the gradient steps of an iteration, so that acting and learning see the same
+    standardised observations.
 
     Args:
         size: D, numbers in an observation.
@@ -34,7 +34,7 @@ class Normalizer(nn.Module):
 
     def forward(self, obs: Tensor) -> Tensor:
         """Return observations (..., D) standardised and clipped, float32."""
-        scale = (self.var + _EPS).rsqrt().float()
+        scale = (self.var + EPS).rsqrt().float()
         return ((obs - self.mean.float()) * scale).clamp(-self.clip, self.clip)
 
     @torch.no_grad()

@@ -1,13 +1,13 @@
-"""The replay: every frame of a run, in append-only files of its folder."""
+"""The replay: every frame of a run, in append-only files in its folder."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
 import shutil
-import warnings
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,17 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import MemoryMappedTensor, TensorDict
 from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from pgdm.errors import CheckpointError, RunError
 from pgdm.paths import replacing
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # torchrl's compiled part, unused here, is of another torch
-    from tensordict import MemoryMappedTensor, TensorDict
-    from torchrl.data import TensorDictReplayBuffer, TensorStorage
-
 _SUFFIX, _ABOUT = ".bin", "columns.json"
+_COPIED_FRAMES = 65_536
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,7 @@ class Column:
     dtype: torch.dtype
     shape: tuple[int, ...] = ()
     entries: tuple[str, ...] = ()
-    """Names of a vector's entries, for who reads the file."""
+    """Names of a vector's entries, for readers of the file."""
 
     @property
     def nbytes(self) -> int:
@@ -46,17 +44,19 @@ class Column:
 class Replay:
     """Frames in the order in which they were seen, sampled uniformly.
 
-    A column is one file. Files are reserved in full at the start, so that a disk without room is
-    an error then and not in the middle of a training; what was appended survives the death of the
-    process. A checkpoint holds the number of frames and a checksum of each column instead of a
-    copy: whatever was appended after it is written over when the run goes on.
+    A column is one file. Files are reserved in full at the start, so that a full disk is an error
+    then and not in the middle of a run; appended frames survive the death of the process. A
+    checkpoint holds the number of frames and a checksum of each column instead of a copy: frames
+    appended after it are overwritten when the run is resumed.
 
     Args:
-        columns: what a frame consists of, by name.
-        capacity: frames there is room for.
+        columns: the values of a frame, by name.
+        capacity: number of frames to reserve room for.
         batch_size: frames in a sample.
         generator: stream of the sampled rows.
         folder: where the files are, or None to keep the frames in memory.
+        mirror: device on which the frames are kept as well and samples are drawn; the files are
+            then written when the state is saved, not with every step.
 
     Raises:
         RunError: if the disk has no room for the files.
@@ -69,6 +69,7 @@ class Replay:
         batch_size: int,
         generator: torch.Generator,
         folder: Path | None = None,
+        mirror: torch.device | None = None,
     ) -> None:
         self.columns, self.capacity, self.folder = dict(columns), capacity, folder
         self._made: list[Path] = []
@@ -84,10 +85,11 @@ class Replay:
                 for name, c in columns.items()
             }
         self._data = TensorDict(data, batch_size=[capacity])
+        self._live = self._data if mirror is None else self._data.to(mirror).clone()
         self._buffer = TensorDictReplayBuffer(
-            storage=TensorStorage(self._data), generator=generator, batch_size=batch_size
+            storage=TensorStorage(self._live), generator=generator, batch_size=batch_size
         )
-        self._crc = dict.fromkeys(columns, 0)
+        self._crc, self._stored = dict.fromkeys(columns, 0), 0
         self._set_length(0)
 
     def __len__(self) -> int:
@@ -108,8 +110,8 @@ class Replay:
             for name, column in self.columns.items()
         }
         self._buffer.extend(TensorDict(rows, batch_size=[count]))
-        for name, values in rows.items():
-            self._crc[name] = zlib.crc32(values.numpy().data, self._crc[name])
+        if self._live is self._data:
+            self._stored_too(rows, count)
 
     def sample(self) -> TensorDict:
         """Return ``batch_size`` frames drawn uniformly, with replacement, all floats as float32."""
@@ -117,22 +119,27 @@ class Replay:
         return drawn.apply(lambda x: x.float() if x.dtype == torch.float16 else x)
 
     def sync(self) -> None:
-        """Wait until the disk has all frames, so that a checkpoint never tells of others."""
+        """Wait until all frames are on the disk, so that a checkpoint never refers to others."""
         for path in self._files():
             with open(path, "rb") as file:
                 os.fsync(file.fileno())
 
     def state_dict(self) -> dict[str, Any]:
-        """Return how many frames there are, and the checksum of each column."""
+        """Return the number of frames and the checksum of each column."""
+        for start in range(self._stored, len(self), _COPIED_FRAMES):
+            new = slice(start, min(start + _COPIED_FRAMES, len(self)))
+            rows = {name: self._live.get(name)[new].cpu() for name in self.columns}
+            self._data[new] = TensorDict(rows, batch_size=[new.stop - new.start])
+            self._stored_too(rows, new.stop - new.start)
         self.sync()
         return {"frames": len(self), "crc32": dict(self._crc)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from the first ``frames`` frames of the files.
+        """Continue from the first ``frames`` frames of the files.
 
         Raises:
-            CheckpointError: if the files do not hold these frames; those that were missing, and
-                only take room now, are deleted again.
+            CheckpointError: if the files do not hold these frames; newly created files are then
+                deleted again.
         """
         frames, expected = int(state["frames"]), state["crc32"]
         where = self.folder or "the memory"
@@ -152,12 +159,21 @@ class Replay:
             found = zlib.crc32(self._data.get(name)[:frames].numpy().data)
             if found != expected.get(name):
                 raise CheckpointError(
-                    f"the replay in {where} does not hold the {frames:,} frames that the "
-                    f"checkpoint was made with (column '{name}' differs): it was cut, altered, "
-                    "or is of another run; restore it, or start anew in another run_dir"
+                    f"the replay in {where} does not hold the {frames:,} frames of the "
+                    f"checkpoint (column '{name}' differs): it was cut, altered, or is of another "
+                    "run; restore it, or start anew in another run_dir"
                 )
         self._crc = {name: int(expected[name]) for name in self.columns}
+        self._stored = frames
+        if self._live is not self._data:
+            self._live[:frames].copy_(self._data[:frames])
         self._set_length(frames)
+
+    def _stored_too(self, rows: Mapping[str, Tensor], count: int) -> None:
+        """Include the next ``count`` rows of the files in the checksums."""
+        self._stored += count
+        for name, values in rows.items():
+            self._crc[name] = zlib.crc32(values.numpy().data, self._crc[name])
 
     def _set_length(self, frames: int) -> None:
         storage = {"_storage": {}, "initialized": True, "_len": frames}
@@ -169,7 +185,7 @@ class Replay:
 
 
 def _describe(folder: Path, columns: Mapping[str, Column]) -> None:
-    """Write down what the files hold, for who reads them without pgdm."""
+    """Describe the files, for reading them without pgdm."""
     about = {
         name: {
             "file": f"{name}{_SUFFIX}",
@@ -184,21 +200,24 @@ def _describe(folder: Path, columns: Mapping[str, Column]) -> None:
 
 
 def _reserve(folder: Path, columns: Mapping[str, Column], capacity: int) -> list[Path]:
-    """Make each column's file as large as it will be; what is in it stays.
+    """Extend each column's file to its final size, keeping its contents.
 
     Returns:
         The files that were missing.
 
     Raises:
-        RunError: if there is no room; the files are then as they were.
+        RunError: if there is no room; the files are then as before.
     """
     sizes = {folder / f"{name}{_SUFFIX}": c.nbytes * capacity for name, c in columns.items()}
     before = {path: path.stat().st_size for path in sizes if path.exists()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        disk = shutil.disk_usage(folder)  # all zero where the file system does not say
+        if disk.total and sum(sizes.values()) - sum(before.values()) > disk.free:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         for path, size in sizes.items():
-            # Not in appending mode, and readable: where the file system cannot reserve (NFS), the
-            # C library reads and writes a byte of each block instead.
+            # Not in appending mode, and readable: if the file system cannot reserve (NFS), the C
+            # library reads and writes a byte of each block instead.
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
             try:
                 os.posix_fallocate(descriptor, 0, size)

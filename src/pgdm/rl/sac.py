@@ -1,9 +1,10 @@
-"""Soft actor-critic: learns from every frame many times, out of a replay."""
+"""Soft actor-critic: learns from every frame many times, from a replay."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -11,31 +12,32 @@ import torch
 from torch import Tensor
 
 from pgdm.errors import ConfigError, RunError
-from pgdm.rl.collector import Rollout, Step
 from pgdm.rl.learner import AlgoCfg
 from pgdm.rl.networks import ActionValue, SquashedCfg, SquashedPolicy
 from pgdm.rl.vec_env import VecEnv
 from pgdm.seeding import torch_stream
 
-if TYPE_CHECKING:  # torchrl takes 4 s to import
+if TYPE_CHECKING:  # torchrl takes 2 s to import
+    from tensordict import TensorDict
+
     from pgdm.rl.replay import Column
 
 
 @dataclass(frozen=True)
 class SACCfg(AlgoCfg):
-    """Settings of soft actor-critic; ``conf/algo/sac.yaml`` has them with their reasons."""
+    """Settings of soft actor-critic; ``conf/algo/sac.yaml`` has the values."""
 
     usual_steps_per_s: ClassVar[float] = 400.0
     usual_frame_bytes: ClassVar[int] = 1_400
 
     reward_scale: float
-    """Rewards are multiplied by it before they are learned from."""
+    """Factor on the rewards that are learned from."""
     adam_betas: list[float]
     """Adam's two decay rates, (2,) each 0..1."""
     critics: int
-    """Number of critics; the lowest one counts."""
+    """Number of critics; their lowest value is used."""
     target_rate: float
-    """Share of the critics that their targets take over in each update, 0..1."""
+    """Share by which the target critics move to the critics in each update, 0..1."""
     batch_size: int
     """M, frames in one update."""
     updates_per_step: int
@@ -43,17 +45,18 @@ class SACCfg(AlgoCfg):
     actor_interval: int
     """The policy is updated once every so many updates of the critics."""
     target_entropy: float
-    """Entropy of the policy that the temperature steers to at first, nat per action entry."""
+    """Entropy of the policy that the temperature aims at first, nats per action dimension."""
     target_entropy_end: float
-    """Where that has fallen to after ``target_entropy_frames``, linearly."""
+    """Target entropy after ``target_entropy_frames``, reached linearly."""
     target_entropy_frames: int
-    """Environment steps until then; not the run's length, so that runs may grow."""
+    """Environment steps over which it falls; not the run's length, so that runs can be extended."""
     temperature_init: float
     """Weight of the entropy in the return at the start."""
     warmup_steps: int
     """Control steps of all simulations before the first update."""
     bfloat16: bool
-    """Whether matrix products are computed in bfloat16."""
+    """Whether matrix products are computed in bfloat16 on devices that have it; see
+    `has_bfloat16`."""
 
     def check(self, num_envs: int) -> None:
         """Check Adam's decay rates; see `AlgoCfg.check`."""
@@ -63,8 +66,13 @@ class SACCfg(AlgoCfg):
                 "below 1, such as [0.9,0.99]"
             )
 
+    @property
+    def networks(self) -> int:
+        """The policy and the critics."""
+        return 1 + self.critics
+
     def capacity(self, num_envs: int, total_frames: int) -> int:
-        """Return the frames of a training, whose last iteration is completed."""
+        """Return ``total_frames`` rounded up to whole iterations."""
         per_iteration = num_envs * self.steps_per_env
         return -(-total_frames // per_iteration) * per_iteration
 
@@ -77,8 +85,9 @@ class SACCfg(AlgoCfg):
 class SACLearner:
     """Holds networks, targets, temperature, optimisers and the replay.
 
-    Beside each step of the simulations it takes ``updates_per_step`` updates on what was seen
-    before. On one thread: a second one serves the physics better than it serves these products.
+    During each step of the simulations it makes ``updates_per_step`` updates on what was seen
+    before. The updates use one thread; a second one speeds up the physics more than these matrix
+    products.
 
     Args:
         env: what the policy acts in, for sizes, reward terms and warm start.
@@ -87,7 +96,7 @@ class SACLearner:
         total_frames: length of the training.
         replay_folder: where the replay is kept, or None to keep it in memory.
         device: where the networks are.
-        num_threads: more than one lets updates and physics overlap.
+        num_threads: with more than one, updates and physics overlap.
     """
 
     def __init__(
@@ -100,8 +109,10 @@ class SACLearner:
         device: str,
         num_threads: int,
     ) -> None:
+        from torchrl.objectives import SoftUpdate
+
         from pgdm.rl.replay import Replay
-        from pgdm.rl.sac_loss import SoftActorCriticLoss, SoftUpdate
+        from pgdm.rl.sac_loss import SoftActorCriticLoss
 
         self.cfg, self._env = cfg, env
         self.overlaps = num_threads > 1
@@ -144,12 +155,13 @@ class SACLearner:
             cfg.batch_size,
             self._samples,
             replay_folder,
+            None if env.device.type == "cpu" else env.device,
         )
         self._updates = 0
         self._logged: list[dict[str, Tensor]] = []
 
     def during_step(self) -> None:
-        """Take the updates of one step.
+        """Make the updates of one step.
 
         Raises:
             RunError: if a loss is not finite; the step is then not taken.
@@ -159,30 +171,33 @@ class SACLearner:
         for _ in range(self.cfg.updates_per_step):
             self._update()
 
-    def after_step(self, step: Step) -> None:
+    def after_step(self, step: TensorDict) -> None:
         """Append a step to the replay, and its observations to their statistics.
 
-        What a simulation that diverged came to is not known, so there is nothing to learn from.
+        Simulations that diverged are left out: what their actions led to is not known.
         """
-        info, discount = step.info, step.info.get("discount")
-        frames = {
-            "observation": step.obs,
-            "action": step.action,
-            "terms": torch.stack(tuple(info["raw_terms"].values()), -1),
-            "discount": torch.ones(len(step.obs)) if discount is None else discount,
-            "terminated": step.terminated,
-            "next_observation": info["final_obs"],
-        }
-        if step.truncated.any():
-            frames = {name: values[~step.truncated] for name, values in frames.items()}
-        self._replay.append(frames)
-        self.model.normalizer.update(step.obs.to(self.model.device))
+        self.model.normalizer.update(step["observation"].to(self.model.device))
+        truncated = step["next", "truncated"][:, 0]
+        known: Any = step[~truncated] if truncated.any() else step
+        discount = known.get(("next", "discount"), None)
+        self._replay.append(
+            {
+                "observation": known["observation"],
+                "action": known["action"],
+                "terms": torch.stack(tuple(known["next", "raw_terms"].values()), -1),
+                "discount": torch.ones(len(known), device=known.device)
+                if discount is None
+                else discount[:, 0],
+                "terminated": known["next", "terminated"][:, 0],
+                "next_observation": known["next", "observation"],
+            }
+        )
 
-    def learn(self, rollout: Rollout) -> dict[str, float]:
+    def learn(self, rollout: TensorDict) -> dict[str, float]:
         """Return the means of what the iteration's updates logged.
 
         Raises:
-            RunError: if a weight is not finite any more.
+            RunError: if a weight is no longer finite.
         """
         logged, self._logged = self._logged, []
         if not math.isfinite(sum(float(p.detach().sum()) for p in self._loss.parameters())):
@@ -197,7 +212,7 @@ class SACLearner:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, targets, temperature, optimisers, streams, and how far the replay is."""
+        """Return networks, targets, temperature, optimisers, streams and the replay's state."""
         return {
             "model": {name: value.clone() for name, value in self.model.state_dict().items()},
             "loss": {name: value.clone() for name, value in self._loss.state_dict().items()},
@@ -211,7 +226,7 @@ class SACLearner:
         """Continue from ``state_dict``.
 
         Raises:
-            CheckpointError: if the replay's files are not those of the checkpoint.
+            CheckpointError: if the replay's files do not match the checkpoint.
         """
         self._replay.load_state_dict(state["replay"])
         self.model.load_state_dict(state["model"])
@@ -260,8 +275,8 @@ class SACLearner:
         loss.backward()
         optimizer.step()
 
-    def _batch(self) -> Any:
-        from pgdm.rl.sac_loss import TensorDict
+    def _batch(self) -> TensorDict:
+        from tensordict import TensorDict
 
         frames = self._replay.sample().to(self.model.device)
         normalize = self.model.normalizer
@@ -269,7 +284,7 @@ class SACLearner:
         reward = self.cfg.reward_scale * (frames["terms"] @ weights.to(frames.device).float())
         ended = frames["terminated"][:, None]
         after = {
-            # A value that is not finite would survive the multiplication that switches it off.
+            # Zeroed: a non-finite value times the 0 of a terminated step is still NaN.
             "observation": normalize(frames["next_observation"].masked_fill(ended, 0.0)),
             "reward": reward[:, None],
             "discount": frames["discount"][:, None],
@@ -285,8 +300,12 @@ class SACLearner:
 
     def _precision(self) -> torch.autocast:
         return torch.autocast(
-            self.model.device.type, dtype=torch.bfloat16, enabled=self.cfg.bfloat16
+            self.model.device.type, dtype=torch.bfloat16, enabled=self._in_bfloat16
         )
+
+    @cached_property  # found out once, not at every update
+    def _in_bfloat16(self) -> bool:
+        return self.cfg.bfloat16 and has_bfloat16(self.model.device.type)
 
     def _adam(self, params: list[Tensor]) -> torch.optim.Adam:
         first, second = self.cfg.adam_betas
@@ -295,11 +314,22 @@ class SACLearner:
         )
 
 
-def columns(env: VecEnv) -> dict[str, Column]:
-    """Return what the replay keeps of each frame.
+def has_bfloat16(device: str) -> bool:
+    """Return whether a device (``cpu``, ``cuda``) has instructions for bfloat16.
 
-    Reward terms are kept before weighting, so that a weight that changes over a training holds for
-    the past too.
+    Without them torch emulates its products: an update takes many times as long as in float32.
+    """
+    if device == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    found = torch.cpu.get_capabilities()
+    return any(found.get(name) for name in ("amx_bf16", "avx512_bf16", "bf16"))
+
+
+def columns(env: VecEnv) -> dict[str, Column]:
+    """Return the replay's columns.
+
+    Reward terms are kept before weighting, so that a weight that changes during training applies
+    to past frames too.
     """
     from pgdm.rl.replay import Column
 

@@ -1,30 +1,23 @@
-"""TorchRL's soft actor-critic loss over pgdm's networks, with a random stream of its own."""
+"""TorchRL's soft actor-critic loss with pgdm's networks and its own random stream."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
+from tensordict import TensorDict
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
 from torch import Tensor
+from torchrl.modules import TanhNormal
+from torchrl.objectives import SACLoss
+from torchrl.objectives.value import TD0Estimator
 
 from pgdm.rl.networks import ActionValue, SquashedPolicy
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # torchrl's compiled part, unused here, is of another torch
-    from tensordict import TensorDict
-    from tensordict.nn import (
-        ProbabilisticTensorDictModule,
-        ProbabilisticTensorDictSequential,
-        TensorDictModule,
-    )
-    from torchrl.modules import TanhNormal
-    from torchrl.objectives import SACLoss, SoftUpdate
-    from torchrl.objectives.value import TD0Estimator
-
-__all__ = ["SoftActorCriticLoss", "SoftUpdate", "TensorDict"]
+from pgdm.rl.torch_state import drawing_from
 
 
 class DiscountedTD0(TD0Estimator):
@@ -41,17 +34,17 @@ class DiscountedTD0(TD0Estimator):
 
 
 class SoftActorCriticLoss(SACLoss):
-    """`SACLoss` whose two halves are asked for one at a time, drawing from a stream of its own.
+    """`SACLoss` whose two halves are computed separately, with draws from its own random stream.
 
-    The critics are evaluated one after the other, not under vmap: benchmark/throughput.py times
-    both.
+    The critics are evaluated one after the other, not under vmap; benchmark/throughput.py compares
+    the two.
 
     Args:
         policy: the actor.
         critics: the critics, of one shape.
         gamma: discount per control step.
         temperature: weight of the entropy at the start.
-        target_entropy: what the temperature steers the policy's entropy to, nat.
+        target_entropy: entropy of the policy that the temperature aims at, nat.
         generator: stream of the actions that the losses sample.
     """
 
@@ -95,30 +88,18 @@ class SoftActorCriticLoss(SACLoss):
         self._generator = generator
 
     def steer_to(self, entropy: float) -> None:
-        """Change the entropy that the temperature steers to, nat."""
+        """Change the entropy that the temperature aims at, nat."""
         target: Any = self.target_entropy  # a buffer
         target.fill_(entropy)
 
     def critic_loss(self, batch: TensorDict) -> Tensor:
         """Return the squared error () of all critics, summed over them."""
-        with _drawing_from(self._generator, self.log_alpha.device):
+        with drawing_from(self._generator, self.log_alpha.device):
             return self.qvalue_v2_loss(batch)[0]
 
     def policy_and_temperature_loss(self, batch: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
         """Return the policy's loss (), the temperature's (), and the policy's entropy (), nat."""
-        with _drawing_from(self._generator, self.log_alpha.device):
+        with drawing_from(self._generator, self.log_alpha.device):
             loss, about = self.actor_loss(batch)
         log_prob = about["log_prob"]
         return loss, self.alpha_loss(log_prob).mean(), -log_prob.mean()
-
-
-@contextmanager
-def _drawing_from(generator: torch.Generator, device: torch.device) -> Iterator[None]:
-    """Let what draws from torch's global streams draw from this one inside."""
-    cuda = device.type == "cuda"
-    with torch.random.fork_rng([device] if cuda else []):
-        if cuda:  # it has no stream that could be handed over: a seed for each loss
-            torch.cuda.manual_seed(int(torch.randint(2**62, (), generator=generator)))
-        torch.set_rng_state(generator.get_state())
-        yield
-        generator.set_state(torch.get_rng_state())

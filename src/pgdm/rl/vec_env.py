@@ -1,17 +1,18 @@
-"""What the learner asks of an environment."""
+"""What collector and learners need of an environment."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, Protocol, Self
 
+import torch
 from torch import Tensor
 
 VecStep = tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]
 
 
-class Finished(Protocol):
-    """Episodes that have ended."""
+class FinishedEpisodes(Protocol):
+    """Episodes that have finished, in the order of their rows."""
 
     def metrics(self) -> dict[str, Tensor]:
         """Return each metric's values (k,), in the order of the episodes."""
@@ -23,11 +24,11 @@ class Finished(Protocol):
 
 
 class VecEnv(Protocol):
-    """N copies of one task, stepped together; all tensors are on the CPU.
+    """N copies of one task, stepped together.
 
-    ``terminated`` says that nothing comes after: the learner adds no value of the last
-    observation. ``truncated`` says that the episode was cut although it could have gone on: the
-    value of ``info["final_obs"]`` stands for the rest.
+    All tensors are on ``device``, and those returned are not changed later. After ``terminated``
+    there is no future reward to estimate. After ``truncated`` the episode could have continued:
+    the value of ``info["final_obs"]`` stands for the rest.
     """
 
     num_envs: int
@@ -36,6 +37,8 @@ class VecEnv(Protocol):
     """D, numbers in an observation."""
     action_dim: int
     """A, numbers in an action."""
+    device: torch.device
+    """Device of all tensors but those of ``state_dict``, which are on the CPU."""
 
     def reset(self) -> Tensor:
         """Restart all simulations; return observations (N, D) float32."""
@@ -45,12 +48,12 @@ class VecEnv(Protocol):
         """Take one control step with actions (N, A) float32; the environment clips them.
 
         Returns:
-            obs (N, D) float32, of finished rows those after the restart; reward (N,) float32;
-            terminated (N,) bool; truncated (N,) bool; info with ``final_obs`` (N, D), the true
-            last observations, ``episodes``, those that finished (`Finished`) in the order of
-            their rows, or None, and {name: (N,)} of the reward terms, ``raw_terms`` before and
-            ``terms`` after weighting; ``discount`` (N,) in [0, 1], by which what comes after the
-            step counts less, or None, or nothing, for 1.
+            obs (N, D) float32, for finished rows the one after the restart; reward (N,) float32;
+            terminated (N,) bool; truncated (N,) bool; info with ``final_obs`` (N, D), for
+            finished rows the last observation before the restart, ``episodes``, the
+            `FinishedEpisodes` in the order of their rows, or None, and {name: (N,)} of the
+            reward terms, ``raw_terms`` before and ``terms`` after weighting; maybe ``discount``
+            (N,) in [0, 1], a factor on all that follows the step, None for 1.
         """
         ...
 
@@ -59,15 +62,15 @@ class VecEnv(Protocol):
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``, to the bit."""
+        """Continue from ``state_dict``, bit-exactly."""
         ...
 
     def warm_start(self) -> Tensor | None:
-        """Return the action (A,) a policy's mean should start from, or None."""
+        """Return the action (A,) that a policy's mean should start at, or None."""
         ...
 
     def reward_weights(self) -> dict[str, float]:
-        """Return the weight of each reward term now, in the order of ``raw_terms``."""
+        """Return the current weight of each reward term, in the order of ``raw_terms``."""
         ...
 
     def set_weights(self, weights: dict[str, float]) -> None:

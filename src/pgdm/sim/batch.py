@@ -1,9 +1,10 @@
-"""N simulations of one scene, stepped on all cores by ``mujoco.batch.Batch``."""
+"""N simulations of one scene, stepped in parallel by ``mujoco.batch.Batch``."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -17,14 +18,17 @@ from pgdm.sim.scene import Scene
 Model = mujoco.MjModel
 Data = mujoco.MjData
 
-_CURRENT = mujoco.mjtStage.mjSTAGE_VEL  # what the agent sees is current after the last substep
+Array = np.ndarray | Tensor
+
+_CURRENT = mujoco.mjtStage.mjSTAGE_VEL  # positions and velocities are updated after a step
 
 
 @dataclass(frozen=True)
 class SimState:
-    """What the agent can see of n simulations: float64, world frame, current.
+    """Observable state of n simulations after the last substep: float64, world frame.
 
-    Points are the hand's tracked geoms, at their centres; the object is at its centre of mass.
+    ``point_*`` refers to the hand's tracked geoms (centres); ``object_pos`` is the object's
+    centre of mass.
     """
 
     qpos: Tensor  # (n, nq) m, rad
@@ -36,20 +40,101 @@ class SimState:
     object_quat: Tensor  # (n, 4) wxyz
     object_vel: Tensor  # (n, 6) linear m/s, then angular rad/s
 
+    @classmethod
+    def of(
+        cls, qpos: Tensor, qvel: Tensor, pos: Tensor, quat: Tensor, cvel: Tensor, com: Tensor
+    ) -> SimState:
+        """Return the state from MuJoCo's quantities of the points' bodies, then of the object's.
+
+        Args:
+            qpos: (n, nq).
+            qvel: (n, nv).
+            pos: (n, P+1, 3) m, centres of the points' geoms, then the object's centre of mass.
+            quat: (n, P+1, 4) wxyz.
+            cvel: (n, P+1, 6) angular, then linear velocity at the centre of mass of the tree.
+            com: (n, P+1, 3) m, that centre of mass.
+        """
+        angular, linear_at_com = cvel[..., :3], cvel[..., 3:]
+        vel = torch.cat((linear_at_com + torch.linalg.cross(angular, pos - com), angular), -1)
+        return cls(
+            qpos=qpos,
+            qvel=qvel,
+            point_pos=pos[:, :-1],
+            point_quat=quat[:, :-1],
+            point_vel=vel[:, :-1],
+            object_pos=pos[:, -1],
+            object_quat=quat[:, -1],
+            object_vel=vel[:, -1],
+        )
+
+
+class Simulations(Protocol):
+    """N simulations of a scene, by any engine; the methods are documented in `SimBatch`."""
+
+    scene: Scene
+    num_envs: int
+    device: torch.device
+    """Where `read` returns states, and where actuator targets are expected."""
+
+    @property
+    def rows(self) -> Array:
+        """All that the next step depends on, one row per simulation, (N, nstate)."""
+        ...
+
+    @property
+    def control_dt_s(self) -> float:
+        """Duration of a control step, s."""
+        ...
+
+    @property
+    def bytes_each(self) -> int:
+        """Memory of the host that each simulation takes."""
+        ...
+
+    def data(self, sim: int) -> mujoco.MjData:
+        """Return the MjData of one simulation."""
+        ...
+
+    def reset(self, ids: Array, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Reset simulations ids (k,)."""
+        ...
+
+    def step(self, ctrl: Array) -> Array:
+        """Take one control step; return which simulations diverged, (N,) bool."""
+        ...
+
+    def read(self, ids: Array | None = None) -> SimState:
+        """Return the current state."""
+        ...
+
+    def restore(self, rows: Array) -> None:
+        """Restore a copy of ``rows``."""
+        ...
+
+    def variation(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the randomised object's friction (N, 3), half-width (N,) m and mass (N,) kg."""
+        ...
+
+    def set_variation(
+        self, ids: np.ndarray, friction: np.ndarray, half_width: np.ndarray, mass: np.ndarray
+    ) -> None:
+        """Set the object's friction (k, 3), half-width (k,) m and mass (k,) kg in simulations."""
+        ...
+
 
 class SimBatch:
-    """N simulations of a scene.
+    """N simulations of a scene, stepped by C MuJoCo on the CPU, float64.
 
     Args:
-        scene: what to simulate.
+        scene: the scene to simulate.
         num_envs: N.
-        num_threads: threads that step them; 0 takes one per core that
-            this process may use. Results do not depend on it.
+        num_threads: number of threads; 0 takes one per core available to this process. Results do
+            not depend on it.
         substeps: physics steps per control step.
     """
 
     def __init__(self, scene: Scene, num_envs: int, num_threads: int, substeps: int) -> None:
-        self.scene = scene
+        self.scene, self.device = scene, torch.device("cpu")
         self.num_envs = num_envs
         self._substeps = substeps
         threads = num_threads or len(os.sched_getaffinity(0))
@@ -64,44 +149,55 @@ class SimBatch:
         self._bodies = np.append(index.point_bodies, index.object_body)
         self._roots = scene.model.body_rootid[self._bodies]
         self._compensated = index.num_compensated
+        in_order = (index.actuators == np.arange(index.num_actuators)).all()
+        self._actuators = slice(None) if in_order else index.actuators
         if index.randomized_geom is not None:
-            self._batch.expand("geom_friction")
-            self._batch.expand("geom_size")
+            for name in ("geom_friction", "geom_size", "body_mass", "body_inertia"):
+                self._batch.expand(name)
 
     @property
     def control_dt_s(self) -> float:
-        """Time of one control step, s; 0.04 in all tasks but hammer-strike."""
+        """Duration of a control step, s; 0.04 in all tasks but hammer-strike."""
         return self.scene.model.opt.timestep * self._substeps
 
     @property
     def rows(self) -> np.ndarray:
-        """Whole integration state, one writable row a simulation, (N, nstate)."""
+        """Full integration state, one writable row per simulation, (N, nstate)."""
         return self._batch.state
 
+    @property
+    def bytes_each(self) -> int:
+        """Memory of one simulation in its present state, bytes."""
+        arrays = (self.rows, *self._f.values(), *self._d.values())
+        data = self.data(0)  # each has its own, with an arena for contacts
+        return sum(a.nbytes for a in arrays) // self.num_envs + data.nbuffer + data.maxuse_arena
+
     def data(self, sim: int) -> mujoco.MjData:
-        """Return one simulation's MjData, a copy that its next call writes over."""
+        """Return the MjData of one simulation, a copy that the next call overwrites."""
         return self._batch.get_data(sim, self._scratch)
 
-    def reset(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Restart simulations ids (k,) from qpos (nq,) and qvel (nv,)."""
+    def reset(self, ids: Array, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Reset simulations ids (k,) to qpos (nq,) and qvel (nv,)."""
+        ids = np.asarray(ids)
         self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._warnings[ids] = 0
         self._f["qpos"][ids] = qpos
         self._f["qvel"][ids] = qvel
         self._batch.forward(ids, stage=_CURRENT)
 
-    def step(self, ctrl: np.ndarray) -> np.ndarray:
-        """Take one control step with actuator targets ctrl (N, nu).
+    def step(self, ctrl: Array) -> np.ndarray:
+        """Take one control step with targets of the hand's driven joints ctrl (N, nu), m and rad.
 
-        Gravity is compensated with the bias forces at the step's start, held for its substeps.
+        Gravity is compensated by qfrc_applied = qfrc_bias of the compensated joints at the start of
+        the step, held for its substeps (released code).
 
         Returns:
-            Which simulations diverged, (N,) bool: MuJoCo raised an error or a warning (bad
-            position, velocity or acceleration, no memory for contacts). Their state is not
-            meaningful any more; the others are not touched.
+            Whether each simulation diverged, (N,) bool: MuJoCo raised an error or a warning (bad
+            position, velocity or acceleration, no memory for contacts). The state of a diverged
+            simulation is meaningless; the others are unaffected.
         """
         n = self._compensated
-        self._f["ctrl"][:] = ctrl
+        self._f["ctrl"][:, self._actuators] = ctrl
         self._f["qfrc_applied"][:, :n] = self._f["qfrc_bias"][:, :n]
         failed: list[int] = []
         try:
@@ -113,9 +209,9 @@ class SimBatch:
         diverged[failed] = True
         return diverged
 
-    def read(self, ids: np.ndarray | None = None) -> SimState:
+    def read(self, ids: Array | None = None) -> SimState:
         """Return the current state of simulations ids, or of all."""
-        rows = slice(None) if ids is None else ids
+        rows = slice(None) if ids is None else np.asarray(ids)
         index = self.scene.index
         pos = torch.from_numpy(
             np.concatenate(
@@ -128,35 +224,25 @@ class SimBatch:
         )
         quat = torch.from_numpy(self._d["xquat"][rows].take(self._bodies, 1))
         cvel = torch.from_numpy(self._d["cvel"][rows].take(self._bodies, 1))
-        angular, linear_at_com = cvel[..., :3], cvel[..., 3:]  # linear: at the COM of the tree
-        arm = pos - torch.from_numpy(self._d["subtree_com"][rows].take(self._roots, 1))
-        linear = linear_at_com + torch.linalg.cross(angular, arm)
-        vel = torch.cat((linear, angular), -1)
-        return SimState(
-            qpos=torch.from_numpy(self._f["qpos"][rows].copy()),
-            qvel=torch.from_numpy(self._f["qvel"][rows].copy()),
-            point_pos=pos[:, :-1],
-            point_quat=quat[:, :-1],
-            point_vel=vel[:, :-1],
-            object_pos=pos[:, -1],
-            object_quat=quat[:, -1],
-            object_vel=vel[:, -1],
-        )
+        com = torch.from_numpy(self._d["subtree_com"][rows].take(self._roots, 1))
+        qpos = torch.from_numpy(self._f["qpos"][rows].copy())
+        qvel = torch.from_numpy(self._f["qvel"][rows].copy())
+        return SimState.of(qpos, qvel, pos, quat, cvel, com)
 
     def body_pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the centre of mass (N, 3) m and orientation (N, 4) wxyz of a body, world frame."""
         return self._d["xipos"][:, body].copy(), self._d["xquat"][:, body].copy()
 
     def push(self, body: int, force: np.ndarray, point: np.ndarray) -> None:
-        """Let forces (N, 3) N act on a body at points (N, 3) m, world frame, until a reset."""
+        """Apply forces (N, 3) N to a body at points (N, 3) m, world frame, until a reset."""
         arm = point - self._d["xipos"][:, body]
         self._f["xfrc_applied"][:, body] = np.concatenate((force, np.cross(arm, force)), 1)
 
-    def restore(self, rows: np.ndarray) -> None:
-        """Continue from rows (N, nstate) that ``rows`` once gave, to the bit.
+    def restore(self, rows: Array) -> None:
+        """Restore the bit-exact state of rows (N, nstate) copied from ``rows`` earlier.
 
         Raises:
-            SceneError: if the rows have another shape: they belong to another scene.
+            SceneError: if the rows have another shape and so belong to another scene.
         """
         if rows.shape != self.rows.shape:
             raise SceneError(
@@ -167,17 +253,27 @@ class SimBatch:
         self._batch.forward(stage=_CURRENT)
         self._warnings = self._f["warning"][..., 1].sum(axis=1)
 
-    def contact(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return friction (N, 3) and half-width (N,) m of the randomised geom."""
-        geom = self._randomized_geom()
+    def variation(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the randomised object's friction (N, 3), half-width (N,) m and mass (N,) kg."""
+        geom, body = self._randomized_geom(), self.scene.index.object_body
         friction, size = self._batch.expand("geom_friction"), self._batch.expand("geom_size")
-        return friction[:, geom].copy(), size[:, geom, 0].copy()
+        mass = self._batch.expand("body_mass")
+        return friction[:, geom].copy(), size[:, geom, 0].copy(), mass[:, body].copy()
 
-    def set_contact(self, ids: np.ndarray, friction: np.ndarray, half_width: np.ndarray) -> None:
-        """Set friction (k, 3) and half-width (k,) m of the randomised geom in simulations ids."""
-        geom = self._randomized_geom()
+    def set_variation(
+        self, ids: np.ndarray, friction: np.ndarray, half_width: np.ndarray, mass: np.ndarray
+    ) -> None:
+        """Set the object's friction (k, 3), half-width (k,) m and mass (k,) kg in simulations ids.
+
+        Its inertia is scaled with the mass; it does not follow the width (released code).
+        """
+        geom, body, model = self._randomized_geom(), self.scene.index.object_body, self.scene.model
         self._batch.expand("geom_friction")[ids, geom] = friction
         self._batch.expand("geom_size")[ids, geom, 0] = half_width
+        self._batch.expand("body_mass")[ids, body] = mass
+        ratio = mass / model.body_mass[body]
+        self._batch.expand("body_inertia")[ids, body] = ratio[:, None] * model.body_inertia[body]
+        self._batch.set_const(ids)
 
     def _randomized_geom(self) -> int:
         geom = self.scene.index.randomized_geom

@@ -1,4 +1,4 @@
-"""Where to look from, so that hand, object and goal are seen all along a motion."""
+"""Camera placement that keeps hand, object and target visible throughout a motion."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import math
 import mujoco
 import numpy as np
 
-# The hand comes from -y over the table's centre: from the front right, hand, object and goal
-# are all seen, and the fingers do not hide the object. The others serve where a board or a door
-# stands in the way. Directions of view around the vertical; 90 looks along +y.
+# Viewing directions about the vertical; 90 looks along +y. The hand approaches from -y over the
+# centre of the table: from the front right, the fingers do not hide the object. The others are
+# alternatives for scenes in which a board or a door blocks the view.
 AZIMUTHS_DEG = (-125.0, -55.0, 180.0, 0.0, 125.0, 55.0)
 ELEVATION_DEG = -22.0
 ROOM_M = 0.2
-"""Free space around the motion of the object's centre: for its size, and for the hand."""
+"""Margin around the motion of the object's centre, for the object's size and the hand."""
 MIN_HEIGHT_M = 0.6
-"""How much of the world the picture's height shows at least."""
+"""Least height of the world shown in the picture."""
 MIDDLE = np.array([[0.0, -0.05, 0.15]])
-"""Shown where no motion is given: above the table's centre, world frame, m."""
-_RAYS = 12  # points of a motion that are tried
-_SURFACES = 40  # that a ray is followed through at most
+"""Point shown without a motion: above the centre of the table, world frame, m."""
+_RAYS = 12  # points of a motion tested for visibility
+_SURFACES = 40  # most surfaces a ray is followed through
 
 
 def camera_for(
@@ -29,11 +29,11 @@ def camera_for(
     motion: np.ndarray | None,
     aspect: float,
 ) -> mujoco.MjvCamera:
-    """Return the closest camera that shows a motion with least in its way.
+    """Return the closest camera that shows a whole motion, with as little of it hidden as possible.
 
     Args:
         model: the scene.
-        data: its state, with current kinematics.
+        data: a state with current kinematics.
         object_body: id of the body that moves along the motion.
         motion: positions of the object's centre of mass, (T, 3) m, world frame, or None.
         aspect: width of the picture over its height.
@@ -60,7 +60,7 @@ def camera_for(
 
 
 def _frame(positions: np.ndarray, azimuth: float, aspect: float) -> tuple[np.ndarray, float]:
-    """Return the point to look at, (3,) m, and how much of the world the height must show, m."""
+    """Return the point to look at, (3,) m, and the height of the world to show, m."""
     forward, right, up = _axes(azimuth)
     across, above = positions @ right, positions @ up  # (T,) m each
     width, height = np.ptp(across) + 2 * ROOM_M, np.ptp(above) + 2 * ROOM_M
@@ -79,7 +79,7 @@ def _axes(azimuth_deg: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _movers(model: mujoco.MjModel, object_body: int) -> np.ndarray:
-    """Return which geoms, (ngeom,) bool, belong to the hand or the object: they move away."""
+    """Return a mask (ngeom,) of the geoms of hand and object, which do not stay in the way."""
     joints = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
     hands = np.unique(model.body_rootid[model.jnt_bodyid[joints]])
     of_hand = np.isin(model.body_rootid, hands)
@@ -94,7 +94,7 @@ def _is_hidden(
     eye: np.ndarray,
     see_through: np.ndarray,
 ) -> bool:
-    """Return whether something between a point and the eye stays there."""
+    """Return whether a geom that cannot be seen through lies between a point and the eye."""
     ray = (eye - point) / np.linalg.norm(eye - point)
     start, left = point.copy(), float(np.linalg.norm(eye - point))
     geom = np.zeros(1, np.int32)

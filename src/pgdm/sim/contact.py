@@ -1,4 +1,4 @@
-"""How deep a hand is in other things, and how far its fingertips are from the object."""
+"""Penetration of a hand into the rest of its scene, and fingertip distance to the object."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ import numpy as np
 from pgdm.sim.scene import Scene
 
 FREE_M = 1e-4
-"""A hand that is less deep in something touches nothing: below what a solver can tell."""
+"""Penetration below which a hand counts as touching nothing."""
 FAR_M = 0.5
-"""Fingertips farther than this from the object count as this far."""
+"""Upper bound of the fingertip distance."""
 
 
 class HandContact:
-    """Tells what of a scene's hand cuts into other things: table, object, board, door.
+    """Penetration of a scene's hand into everything else: table, object, board, door.
 
     Args:
-        scene: its actuated joints are the hand's, first in qpos.
+        scene: a scene, whose hand's joints are first in qpos.
     """
 
     def __init__(self, scene: Scene) -> None:
         model, hand = scene.model, scene.hand
         self._model, self._data = model, mujoco.MjData(model)
         self.first_finger_joint = hand.num_base_joints + hand.num_wrist_joints
-        """Finger joints are those from here to nu."""
-        joints = model.jnt_bodyid[: model.nu]
+        """Index of the first finger joint in qpos; finger joints run from here to n."""
+        joints = model.jnt_bodyid[: scene.index.num_joints]
         of_hand = np.isin(model.body_rootid, model.body_rootid[joints])
         self._of_hand = of_hand[model.geom_bodyid]
         with_joint = set(joints[self.first_finger_joint :].tolist())
         parents = model.body_parentid
-        root = np.full(model.nbody, -1)  # body at a finger's base, of each body in that finger
+        root = np.full(model.nbody, -1)  # of each body, the first body of its finger; -1 if none
         for body in range(1, model.nbody):  # parents come before their children
             inherited = root[parents[body]]
             root[body] = body if inherited < 0 and body in with_joint else inherited
@@ -40,10 +40,10 @@ class HandContact:
         self.num_fingers = len(bases)
         self._finger_of_geom = finger[model.geom_bodyid]
         self.finger_of_joint = finger[joints[self.first_finger_joint :]]
-        """Number of the finger, from 0, of each finger joint."""
+        """Index of the finger of each finger joint."""
 
     def finger_of_geom(self, geom: int) -> int:
-        """Return the number of the finger that a geom belongs to, -1 if to none."""
+        """Return the index of the finger that a geom belongs to, -1 if none."""
         return int(self._finger_of_geom[geom])
 
     def depth(self, qpos: np.ndarray) -> float:
@@ -51,26 +51,27 @@ class HandContact:
         return float(self.depths(qpos).max())
 
     def depths(self, qpos: np.ndarray) -> np.ndarray:
-        """Return the deepest penetration of each finger, then of all else of the hand, (F+1,) m."""
+        """Return the deepest penetration of each finger, then of the rest of the hand, (F+1,) m."""
         depths = np.zeros(self.num_fingers + 1)
         for finger, dist in zip(*self._near(self._at(qpos), 0.0), strict=True):
             depths[finger] = max(depths[finger], -dist)
         return depths
 
     def overlap(self, qpos: np.ndarray, clearance_m: float) -> float:
-        """Return by how much all contacts at qpos (nq,) are closer than a clearance, summed, m.
+        """Return the sum of max(0, clearance - distance) over the hand's contacts at qpos (nq,), m.
 
-        0 means that nothing is; more clearance than the geoms' margins is not seen.
+        MuJoCo reports contacts only within the margins of the geoms, so that a larger clearance has
+        no effect.
         """
         return self.too_near(self._at(qpos), clearance_m)
 
     def too_near(self, data: mujoco.MjData, clearance_m: float) -> float:
-        """Return the same of a state whose contacts are current, perhaps with wider margins."""
+        """Return `overlap` for a state with current contacts."""
         dist = self._near(data, clearance_m)[1]
         return float((clearance_m - dist).sum())
 
     def _at(self, qpos: np.ndarray) -> mujoco.MjData:
-        """Return a state at qpos (nq,) with its contacts."""
+        """Return a state at qpos (nq,) with current contacts."""
         model, data = self._model, self._data
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
@@ -79,7 +80,7 @@ class HandContact:
         return data
 
     def _near(self, data: mujoco.MjData, clearance_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return finger (-1: other parts) and distance of the contacts that are too close."""
+        """Return finger (-1: rest of the hand) and distance of the contacts within a clearance."""
         pairs, dist = data.contact.geom, data.contact.dist
         of_hand = self._of_hand[pairs]  # (contacts, 2)
         near = (of_hand[:, 0] != of_hand[:, 1]) & (dist < clearance_m)
@@ -88,10 +89,10 @@ class HandContact:
 
 
 class FingertipDistance:
-    """Tells how far the surface of each finger's last link is from the object's.
+    """Distance between the surfaces of each finger's last link and of the object.
 
     Args:
-        scene: of the task.
+        scene: scene of the task.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -102,13 +103,13 @@ class FingertipDistance:
         self._object = np.flatnonzero(solid & of_object).tolist()
         self._links = []
         for body in index.point_bodies[index.fingertips].tolist():
-            # A fingertip's point may be on a body of its own, at the end of the last link.
+            # A fingertip's point may be on a separate body at the end of the last link.
             while not (solid & (model.geom_bodyid == body)).any():
                 body = model.body_parentid[body]
             self._links.append(np.flatnonzero(solid & (model.geom_bodyid == body)).tolist())
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
-        """Return the distances (F,) m of a state with current kinematics; below 0 inside."""
+        """Return the distances (F,) m of a state with current kinematics, negative inside."""
         return np.array([self._least(data, link) for link in self._links])
 
     def _least(self, data: mujoco.MjData, link: list[int]) -> float:

@@ -1,4 +1,4 @@
-"""Small spheres that point something out in a picture."""
+"""Small spheres that mark points in a picture."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ MARK_RGBA = np.array([0.1, 0.95, 1.0, 1.0], np.float32)
 
 
 def add_marks(scene: mujoco.MjvScene, points: np.ndarray) -> None:
-    """Add a sphere at each point (n, 3) m, world frame, as far as the scene has room."""
-    size, turn = np.full(3, MARK_RADIUS_M), np.eye(3).ravel()
+    """Add a sphere at each point (n, 3) m, world frame, up to the scene's capacity."""
+    size, rotation = np.full(3, MARK_RADIUS_M), np.eye(3).ravel()
     for point in points[: scene.maxgeom - scene.ngeom]:
         mark = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(mark, mujoco.mjtGeom.mjGEOM_SPHERE, size, point, turn, MARK_RGBA)
-        mark.emission = 0.6  # seen in the hand's shadow too
+        mujoco.mjv_initGeom(mark, mujoco.mjtGeom.mjGEOM_SPHERE, size, point, rotation, MARK_RGBA)
+        mark.emission = 0.6  # visible in the hand's shadow as well
         mark.category = mujoco.mjtCatBit.mjCAT_DECOR
         scene.ngeom += 1

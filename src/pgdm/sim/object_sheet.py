@@ -1,4 +1,4 @@
-"""A picture of one object: how it looks and what it touches with, from three sides."""
+"""A picture of one object from three sides: its appearance and its collision geometry."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from pgdm.errors import SceneError
-from pgdm.library.check import compile_tracked
+from pgdm.library.checks.compiled import compile_tracked
 from pgdm.sim.render import Renderer, write_image
 
 PANEL = 400, 320  # pixels, width and height
 SIDES = (("front", 90.0, -15.0), ("right", 180.0, -15.0), ("top", 90.0, -89.0))
-"""Name, and the direction in which one looks: around the vertical and up, degrees."""
+"""Name, azimuth and elevation of the viewing direction, degrees."""
 _TITLE_HEIGHT, _TEXT_SIZE, _MARGIN = 34, 18, 8  # pixels
-_ROOM = 0.95  # share of the object's size that the picture shows
+_ROOM = 0.95  # height of the picture at the object, relative to its size
 _FOVY_DEG = 25.0
-_GOLDEN = 0.618034  # share of the circle of colours between neighbours: none look alike
+_GOLDEN = 0.618034  # hue step between neighbouring parts: no two look alike
 _STAGE = """<mujoco><visual><headlight ambient=".35 .35 .35" diffuse=".35 .35 .35"/>
 <global fovy="25"/></visual><asset><texture type="skybox" builtin="flat" rgb1=".93 .94 .95"
 rgb2=".93 .94 .95" width="8" height="8"/></asset><worldbody><light pos="-1 -2 3" dir=".3 .6 -.9"
@@ -28,16 +28,16 @@ diffuse=".35 .35 .35" castshadow="false"/></worldbody></mujoco>"""
 
 
 def write_object_sheet(object_xml: Path, title: Sequence[str], path: Path) -> Path:
-    """Write a PNG: above the object's look, below its convex parts in colours.
+    """Write a PNG: the object's appearance above, its convex collision parts in colours below.
 
     Args:
         object_xml: the object's model.
-        title: lines of text for the two rows.
+        title: headings of the two rows.
         path: the file to write.
 
     Raises:
-        SceneError: the model does not compile.
-        RenderError: no OpenGL works here, or the file cannot be written.
+        SceneError: if the model does not compile.
+        RenderError: if no OpenGL works here or the file cannot be written.
     """
     model, body = _stage(object_xml)
     middle, size = _extent(model, body)
@@ -69,7 +69,7 @@ def _stage(object_xml: Path) -> tuple[mujoco.MjModel, int]:
 
 
 def _extent(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, float]:
-    """Return the middle (3,) m of an object and the diameter of a ball around it, m."""
+    """Return the centre (3,) m of an object and the largest side of a box around it, m."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     geoms = np.flatnonzero(model.geom_bodyid == body)
@@ -79,7 +79,7 @@ def _extent(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, float]:
 
 
 def _paint(model: mujoco.MjModel, body: int, parts: bool) -> None:
-    """Show either what is seen of an object, or what it touches with, each part in a colour."""
+    """Show either the visual or the collision geoms of an object, the latter each in a colour."""
     for i, geom in enumerate(np.flatnonzero(model.geom_bodyid == body)):
         touches = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
         colour = colorsys.hsv_to_rgb(i * _GOLDEN % 1.0, 0.6, 0.95) if parts else (0.8, 0.75, 0.65)

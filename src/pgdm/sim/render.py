@@ -1,4 +1,4 @@
-"""Pictures and films of a scene, with the goal as a translucent ghost."""
+"""Images and videos of a scene, with the target as a translucent object, the ghost."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 import weakref
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import mujoco
@@ -21,26 +20,27 @@ from pgdm.sim.marks import add_marks
 
 MAX_GEOMS = 2000
 GHOST_RGBA = np.array([0.15, 0.95, 0.45, 0.35], np.float32)
-HAND_ALPHA = 0.25  # of a hand that must not hide what it touches
+HAND_ALPHA = 0.25  # of a hand that would hide marks
 # Software OpenGL: a frame of 640x480 costs about 75 ms with these, 230 ms with the scene's own.
 SHADOW_SIZE = 1024
 SAMPLES = 4
-SHADOW_SCALE = 0.1  # of the lamp's cone: its shadows need not reach beyond the table
-VIDEO_FPS = 25  # control steps a second (SPEC 1): films run at the speed of the task
+SHADOW_SCALE = 0.1  # of the light's cone: shadows need not reach beyond the table
+VIDEO_FPS = 25  # control steps per second: videos play in real time
 
 
 class Renderer:
-    """Draws one scene; keep it for many frames.
+    """Renders one scene; expensive to construct, so keep it for many images.
 
     Args:
         model: the compiled scene.
-        object_body: id of the tracked body; what is rigidly attached to it is drawn as the ghost.
-        width: of the pictures, pixels.
-        height: of the pictures, pixels.
-        motion: positions of the object's centre of mass that the picture should show, (T, 3) m,
-            usually the task's exemplar motion; None shows the middle of the table.
-        follow_m: how much of the world the height shows where the camera follows the object from
-            near; None shows all of the motion from where it stands.
+        object_body: id of the tracked body; it and all rigidly attached to it form the ghost.
+        width: width of the images, pixels.
+        height: height of the images, pixels.
+        motion: positions of the object's centre of mass to keep in view, (T, 3) m, usually the
+            exemplar motion; None shows the middle of the table.
+        follow_m: height of the world to show with a camera that follows the object, m; None for a
+            fixed camera that shows the whole motion.
+        opengl: MuJoCo's class of OpenGL contexts; None: the first that works here.
 
     Raises:
         RenderError: if no OpenGL works here.
@@ -54,6 +54,7 @@ class Renderer:
         height: int = 480,
         motion: np.ndarray | None = None,
         follow_m: float | None = None,
+        opengl: type[Any] | None = None,
     ) -> None:
         self.model, self.width, self.height = model, width, height
         self._object_body = object_body
@@ -75,7 +76,7 @@ class Renderer:
             half_angle = math.radians(model.vis.global_.fovy) / 2
             self._camera.distance = follow_m / 2 / math.tan(half_angle)
         self._rect = mujoco.MjrRect(0, 0, width, height)
-        self._gl, self._mjr = _open(model, width, height)
+        self._gl, self._mjr = _open(model, width, height, opengl)
         self._free = weakref.finalize(self, _close, self._gl, self._mjr)
 
     def render(
@@ -85,18 +86,18 @@ class Renderer:
         caption: str = "",
         marks: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Draw a state.
+        """Render a state.
 
         Args:
             data: the state, with current kinematics.
-            goal: where the object should be: its centre of mass (3,) m and its orientation (4,)
-                wxyz, world frame; None draws no ghost.
+            goal: target of the object: centre of mass (3,) m and orientation (4,) wxyz, world
+                frame; None draws no ghost.
             caption: text in the upper left corner.
-            marks: points (n, 3) m, world frame, to show as small spheres, through a hand that is
-                translucent then.
+            marks: points (n, 3) m, world frame, to show as small spheres; the hand is then drawn
+                translucent.
 
         Returns:
-            The picture, (height, width, 3) uint8.
+            The image, (height, width, 3) uint8.
 
         Raises:
             RenderError: after ``close``.
@@ -132,7 +133,7 @@ class Renderer:
         caption: str = "",
         marks: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Draw joint positions qpos (nq,); otherwise as ``render``."""
+        """Render joint positions qpos (nq,); otherwise as ``render``."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self._data)
         mujoco.mj_comPos(self.model, self._data)
@@ -140,24 +141,19 @@ class Renderer:
         return self.render(self._data, goal, caption, marks)
 
     def look(self, lookat: np.ndarray, distance: float, azimuth: float, elevation: float) -> None:
-        """Place the camera: at a distance, m, from a point (3,) m; direction of view in degrees."""
+        """Place the camera at a distance, m, from a point (3,) m; viewing angles in degrees."""
         self._camera.lookat[:], self._camera.distance = lookat, distance
         self._camera.azimuth, self._camera.elevation = azimuth, elevation
 
     def close(self) -> None:
-        """Give back what OpenGL holds; harmless when called twice."""
+        """Release OpenGL's resources; may be called twice."""
         self._free()
 
     def __enter__(self) -> Renderer:
-        """Return itself."""
+        """Return the renderer."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close."""
         self.close()
 
@@ -167,12 +163,12 @@ class Renderer:
                 geom.rgba[3] = min(geom.rgba[3], HAND_ALPHA)
 
     def _add_ghost(self, data: mujoco.MjData, com: np.ndarray, quat: np.ndarray) -> None:
-        """Add the object's visible geoms once more, moved from where it is to the goal."""
+        """Draw the object's visible geoms a second time, at the target."""
         goal_rot = np.empty(9)
         mujoco.mju_quat2Mat(goal_rot, np.asarray(quat, float))
         goal_rot = goal_rot.reshape(3, 3)
-        goal_pos = np.asarray(com, float) - goal_rot @ self._com  # the goal is the COM's
-        turn = goal_rot @ data.xmat[self._object_body].reshape(3, 3).T
+        goal_pos = np.asarray(com, float) - goal_rot @ self._com  # the target is the COM's
+        rotation = goal_rot @ data.xmat[self._object_body].reshape(3, 3).T
         start = data.xpos[self._object_body]
         kind = mujoco.mjtObj.mjOBJ_GEOM
         shown = [
@@ -182,19 +178,21 @@ class Renderer:
         ]
         for geom in shown[: self._scene.maxgeom - self._scene.ngeom]:
             ghost = self._scene.geoms[self._scene.ngeom]
-            pos = goal_pos + turn @ (geom.pos - start)
-            mat = (turn @ geom.mat).ravel()
+            pos = goal_pos + rotation @ (geom.pos - start)
+            mat = (rotation @ geom.mat).ravel()
             mujoco.mjv_initGeom(ghost, geom.type, geom.size, pos, mat, GHOST_RGBA)
-            ghost.size[:] = geom.size  # already in the scene's form, which initGeom would redo
+            ghost.size[:] = geom.size  # already converted, which initGeom would repeat
             ghost.dataid = geom.dataid
             ghost.category = mujoco.mjtCatBit.mjCAT_DECOR
             self._scene.ngeom += 1
 
 
-def _open(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    """Make the OpenGL context and upload the scene's meshes and textures."""
+def _open(
+    model: mujoco.MjModel, width: int, height: int, opengl: type[Any] | None
+) -> tuple[Any, mujoco.MjrContext]:
+    """Create the OpenGL context and upload the scene's meshes and textures."""
     try:
-        context = context_class()(width, height)
+        context = (opengl or context_class())(width, height)
         context.make_current()
     except (ImportError, RuntimeError, AttributeError, OSError) as error:
         raise RenderError(f"OpenGL does not start: {error}") from error
@@ -209,7 +207,7 @@ def _open(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.M
 
 @contextlib.contextmanager
 def _drawn_cheaply(model: mujoco.MjModel, width: int, height: int) -> Iterator[None]:
-    """Give a model our settings while MuJoCo reads them; physics does not know them.
+    """Replace a model's visual settings while MuJoCo reads them; the physics is unaffected.
 
     The scene's own off-screen buffer is 3024x1680 with 8 samples: 300 MB in software OpenGL.
     """
@@ -231,19 +229,19 @@ def _close(context: Any, resources: mujoco.MjrContext) -> None:
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = VIDEO_FPS) -> Path:
-    """Write an MP4 (H.264, yuv420p: plays in every browser) and its poster.
+    """Write an MP4 (H.264, yuv420p: plays in every browser) and its poster image.
 
     Args:
-        path: of the MP4; it appears only when complete, replacing an older one.
-        frames: pictures (H, W, 3) uint8, all of one size, at least one. Odd sizes lose their
-            last row or column.
-        fps: pictures per second.
+        path: path of the MP4; it appears only when complete, and replaces an older one.
+        frames: images (H, W, 3) uint8 of equal size, at least one. Odd sizes lose their last row or
+            column.
+        fps: frames per second.
 
     Returns:
-        The poster's path, ``path`` with suffix ``.png``: the picture in the film's middle.
+        Path of the poster, ``path`` with suffix ``.png``: the frame in the middle of the video.
 
     Raises:
-        RenderError: if there is no frame, or the file cannot be written.
+        RenderError: if there are no frames or the file cannot be written.
     """
     import imageio_ffmpeg
 
@@ -270,7 +268,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int = VIDEO_FPS) 
 
 
 def write_image(path: Path, picture: np.ndarray) -> Path:
-    """Write a picture (H, W, 3) uint8 as PNG, whole or not at all.
+    """Write an image (H, W, 3) uint8 as PNG, atomically.
 
     Raises:
         RenderError: if the file cannot be written.
@@ -284,11 +282,11 @@ def write_image(path: Path, picture: np.ndarray) -> Path:
 
 @contextlib.contextmanager
 def _replacing(path: Path) -> Iterator[Path]:
-    """Give a name to write to; what was written takes the place of ``path`` in one step."""
+    """Yield a temporary path, which then replaces ``path`` atomically."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temp:
-            temp.touch()  # a folder that cannot be written is found before ffmpeg starts
+            temp.touch()  # detects an unwritable folder before ffmpeg starts
             yield temp
     except (OSError, RuntimeError) as error:
         raise RenderError(f"cannot write {path}: {error}") from error

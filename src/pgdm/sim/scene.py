@@ -1,25 +1,28 @@
-"""Table + hand + objects -> one compiled model and a table of what is where in it."""
+"""Scene of a task: table, hand and objects as one compiled model, and an index of its parts."""
 
 from __future__ import annotations
 
 import copy
 import hashlib
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from pgdm.errors import SceneError
 from pgdm.library import Library
-from pgdm.library.check import compile_tracked
-from pgdm.library.published_masses import RATIOS
+from pgdm.library.checks.compiled import compile_tracked
+from pgdm.library.couplings import Couplings
+from pgdm.sim.assembly import assemble
+from pgdm.sim.hand_model import joint_actuators, reset_joints
 
-# SPEC 5, R: the randomised contact geom outranks what it touches, so that its friction counts.
-RANDOMIZED_PRIORITY = 10
+OBJECT_MASSES = ("volume", "published")
+WARP = "warp"
+ENGINES = ("mujoco", WARP)
 
-
-# Fields of a model that say how its bodies, joints, contacts and actuators behave.
+_NEVER_M = 10.0  # no two geoms penetrate this deep
+_FREE_JOINTS = 6  # three slides and three hinges, as in the benchmark
+# Fields of a model that determine its physics.
 _PHYSICS = (
     *("body_pos", "body_quat", "body_mass", "body_inertia", "body_ipos", "body_iquat"),
     *("jnt_pos", "jnt_axis", "jnt_range", "jnt_margin", "jnt_solref", "jnt_solimp"),
@@ -33,103 +36,126 @@ _PHYSICS = (
 
 @dataclass(frozen=True)
 class PlacementCfg:
-    """Where a body of an object stands, if not where the object's own file puts it."""
+    """Placement of a body of an object, instead of that in the object's file."""
 
     body: str
     """Scene name of the body, such as ``door/frame``."""
     pos_m: list[float] | None
-    """Position in the world frame, (3,) m, or None to leave it."""
+    """Position in the world frame, (3,) m; None keeps the file's."""
     quat: list[float] | None
-    """Orientation in the world frame, (4,) wxyz, or None to leave it."""
+    """Orientation in the world frame, (4,) wxyz; None keeps the file's."""
 
 
 @dataclass(frozen=True)
 class TaskCfg:
-    """One task: what is followed along which motion (SPEC 1)."""
+    """One task: which object should follow which exemplar motion."""
 
     id: str
     """Task id, ``<object>-<motion>`` or ``<hand>-<object>``."""
     objects: list[str]
     """Library names of the objects in the scene, in the order of their joints."""
     tracked_body: str
-    """Scene name of the followed body; its centre of mass and orientation count."""
+    """Scene name of the tracked body, whose centre of mass and orientation should follow."""
     motion: str
-    """Library id of the exemplar motion with its stored start states."""
+    """Library id of the exemplar motion, which includes stored start states."""
     timestep_s: float
     """Physics timestep, s."""
     placements: list[PlacementCfg]
-    """Bodies placed elsewhere than in their own file."""
+    """Bodies placed differently than in their files."""
     randomize: bool
-    """Whether friction and size of the first object's contact geom vary per reset (SPEC 5)."""
+    """Whether friction, size and mass of the object are randomised at every reset."""
     tcdm30: bool
-    """Whether the task belongs to the abridged suite."""
+    """Whether the task is one of the 30 on which the paper compares methods."""
     pregrasp_source: str
-    """Where the paper's pre-grasp came from: mocap, teleop, labeled or learned; search: ours."""
+    """Origin of the pre-grasp: mocap, teleop, labeled or learned; search: pgdm's own."""
     trajectory_source: str
-    """Where the exemplar motion came from: mocap, expert or animator; keyframes: pgdm's own."""
+    """Origin of the exemplar motion: mocap, expert or animator; keyframes: pgdm's own."""
     paper_success: float | None
     """Success of the paper's PGDM after 50M frames, mean of 3 seeds (0..1)."""
     paper_com_error: float | None
-    """The paper's error column, compared with ``com_error_released``, m."""
+    """The paper's error, comparable with ``com_error_released``, m."""
+
+
+_BARE_TASK = TaskCfg(
+    *("bare", ["ball"], "ball/object", "none", 0.004, [], False, False, "none", "none"),
+    paper_success=None,
+    paper_com_error=None,
+)
+_BARE = """<mujoco><option timestep="0.004" iterations="20" noslip_iterations="20"/>
+<visual><headlight ambient=".35 .35 .35" diffuse=".35 .35 .35"/><global fovy="25"/></visual>
+<asset><texture type="skybox" builtin="flat" rgb1=".93 .94 .95" rgb2=".93 .94 .95" width="8"
+height="8"/></asset><worldbody><light pos="-1 -2 3" dir=".3 .6 -.9" diffuse=".35 .35 .35"/>
+<geom name="table" type="box" size=".45 .45 .025" pos="0 0 -.025" rgba=".8 .78 .74 1"/>
+</worldbody></mujoco>"""
+_AXES = "".join(
+    f'<joint type="{kind}" axis="{axis}"/>'
+    for kind in ("slide", "hinge")
+    for axis in ("1 0 0", "0 1 0", "0 0 1")
+)
+_BALL = f"""<mujoco model="ball"><worldbody><body name="object" pos="0 0 .031">{_AXES}
+<geom size=".03" rgba=".16 .45 .65 1"/></body></worldbody></mujoco>"""
 
 
 @dataclass(frozen=True)
 class HandCfg:
-    """What the MDP needs to know of a hand beyond its model."""
+    """Properties of a hand that its model does not contain."""
 
     name: str
     """Library name and scene prefix of the hand."""
     points: list[str]
     """Geoms (each in a body of the same name) whose poses are observed, in observation order."""
     fingertips: list[int]
-    """Which of the points are fingertips."""
+    """Indices of the points that are fingertips."""
     human_fingers: list[str]
     """Human finger that each fingertip follows: index, middle, ring, little or thumb."""
     gravity_compensation: str
-    """``all`` actuated joints are held against gravity, or only the ``base`` joints."""
+    """Joints with gravity compensation: ``all`` actuated ones, or only the ``base``."""
     num_base_joints: int
-    """Number of joints, first in qpos, that place the wrist."""
+    """Number of base joints, first in qpos, which move the hand as a whole."""
     num_wrist_joints: int
-    """Number of joints after them that turn the palm; those that follow are the fingers'."""
+    """Number of joints after them that turn the palm; the rest are the finger joints."""
     mean_fingers_rad: list[float]
-    """Finger joints of the hand's mean pre-grasp, in the order of qpos, rad."""
+    """Finger joints of the mean pre-grasp of the hand, in the order of qpos, rad."""
     mount_body: str
-    """Body that carries the base joints, child of the world."""
+    """Body that the base joints move, a child of the world."""
 
 
 @dataclass(frozen=True)
 class SimCfg:
-    """Solver settings (SPEC 1, Scene)."""
+    """Physics engine and solver settings."""
 
+    engine: str
+    """``mujoco``: C MuJoCo, float64, on the CPU; ``warp``: MuJoCo Warp, float32, on ``device``, for
+    training only: evaluations always run in C MuJoCo."""
     solver_iterations: int
-    """Newton iterations at most per physics step."""
+    """Maximum iterations of the Newton solver per physics step."""
     noslip_iterations: int
     """Iterations of the noslip solver per physics step."""
     object_mass: str
-    """``volume``: mass and inertia of objects as MuJoCo 4.0 takes them from their volume;
-    ``published``: scaled to the masses that MuJoCo had when the benchmark was published."""
-
-
-OBJECT_MASSES = ("volume", "published")
-
-
-_NEVER_M = 10.0  # no two geoms are that deep in each other
-_FREE_JOINTS = 6  # three slides and three hinges, as the benchmark has them
+    """``volume``: mass and inertia of objects as MuJoCo 4.0 computes them from their volume;
+    ``published``: scaled to the masses that the MuJoCo of the paper's time computed."""
 
 
 @dataclass(frozen=True)
 class SceneIndex:
-    """Ids and constants of a scene, looked up by name once."""
+    """Ids and constants of a scene, looked up once."""
 
     point_geoms: np.ndarray  # (P,) geom ids
     point_bodies: np.ndarray  # (P,) body ids
     object_body: int
-    fingertips: np.ndarray  # (F,) rows of the points
-    num_actuators: int
-    num_compensated: int  # joints held against gravity, first in qvel
+    fingertips: np.ndarray  # (F,) indices of the points
+    num_joints: int  # n, of the hand; they are first in qpos
+    num_actuators: int  # nu; less than n if joints are coupled
+    driven: np.ndarray  # (nu,) the hand's joints that have an actuator, ascending
+    actuators: np.ndarray  # (nu,) id of the actuator of each; targets are in this order
+    couplings: Couplings  # of the other joints, which have none
+    reset: np.ndarray  # (n,) m, rad: the reset pose
+    num_compensated: int  # joints with gravity compensation, first in qvel
     num_base_joints: int
-    ctrl_low: np.ndarray  # (nu,)
+    ctrl_low: np.ndarray  # (nu,) m, rad
     ctrl_high: np.ndarray  # (nu,)
+    joint_low: np.ndarray  # (n,) m, rad: control range, or a coupled joint's own range
+    joint_high: np.ndarray  # (n,)
     mount_pos: np.ndarray  # (3,) m, world frame, base joints at zero
     mount_quat: np.ndarray  # (4,) wxyz
     randomized_geom: int | None
@@ -144,13 +170,13 @@ class Scene:
     task: TaskCfg
     hand: HandCfg
     asset_source: str
-    """The library's source that serves the task's assets, or its sources: ``own+checkout``."""
+    """Library source or sources of the task's assets, such as ``own+checkout``."""
     object_prefixes: tuple[str, ...]
-    """How names of the objects' bodies begin; not always with the library's name."""
+    """Prefixes of the names of the objects' bodies; they may differ from the library names."""
 
     @property
     def lies_free(self) -> bool:
-        """Whether the tracked object hangs on nothing: six joints between it and the world."""
+        """Whether the tracked object is free: six joints between it and the world."""
         body, joints = self.index.object_body, 0
         while body:
             joints += int(self.model.body_jntnum[body])
@@ -158,11 +184,16 @@ class Scene:
         return joints == _FREE_JOINTS
 
     def digest(self) -> str:
-        """Return a SHA-256 over all that the physics depends on: equal scenes move equally."""
+        """Return a SHA-256 of everything that determines the physics."""
         digest = hashlib.sha256()
         for name in _PHYSICS:
             digest.update(np.ascontiguousarray(getattr(self.model, name)).tobytes())
         option = self.model.opt
+        index = self.index
+        if len(index.couplings.rows):
+            digest.update(self.model.eq_data[index.couplings.rows].tobytes())
+        if index.reset.any():
+            digest.update(index.reset.tobytes())
         numbers = (option.timestep, option.iterations, option.noslip_iterations, option.cone)
         digest.update(repr(numbers).encode())
         return digest.hexdigest()
@@ -172,97 +203,54 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
     """Compile the scene of a task.
 
     Raises:
-        SceneError: if it does not compile or a body, geom or joint is missing.
+        SceneError: if it does not compile, a body, geom or joint is missing, or the hand's model is
+            not what pgdm assumes.
         LibraryError: if the library lacks an asset.
     """
-    source = library.source_of(task.motion)
-    spec = _load(library.scene_xml(source))
-    spec.option.timestep = task.timestep_s
-    spec.option.iterations = sim.solver_iterations
-    spec.option.noslip_iterations = sim.noslip_iterations
-    parts = [_load(library.hand_xml(hand.name, source))]
-    for name in task.objects:
-        parts.append(_load(library.object_xml(name, source)))
-        if sim.object_mass == "published":
-            scale_mass(parts[-1], RATIOS.get(name, 1.0))
-    for part in parts:
-        spec.attach(part, frame=spec.worldbody.add_frame(), prefix=f"{part.modelname}/")
-    for placement in task.placements:
-        _place(spec, placement)
-    randomized = _randomized_geom(spec, task) if task.randomize else None
+    spec, folders, randomized = assemble(library, task, hand, sim)
     try:
         model = compile_tracked(spec, task.tracked_body)
     except ValueError as error:
         raise SceneError(f"the scene of task '{task.id}' does not compile: {error}") from error
-    index, origins = _index(model, task, hand, randomized), library.origins(task.motion)
-    prefixes = tuple(f"{part.modelname}/" for part in parts[1:])
-    return Scene(model, index, task, hand, origins, prefixes)
+    index, origins = _index(model, task, hand, randomized), library.origins(task.motion, hand.name)
+    return Scene(model, index, task, hand, origins, tuple(folders)[2:])
+
+
+def bare_scene(model: mujoco.MjSpec, hand: HandCfg) -> Scene:
+    """Compile a hand with a ball on a table, to look at the hand before it has any task.
+
+    Args:
+        model: the hand's model; it stays as it is.
+        hand: its settings.
+
+    Raises:
+        SceneError: as :func:`build_scene`.
+    """
+    spec = mujoco.MjSpec.from_string(_BARE)
+    spec.attach(model.copy(), frame=spec.worldbody.add_frame(), prefix=f"{hand.name}/")
+    spec.attach(mujoco.MjSpec.from_string(_BALL), frame=spec.worldbody.add_frame(), prefix="ball/")
+    try:
+        compiled = compile_tracked(spec, _BARE_TASK.tracked_body)
+    except ValueError as error:
+        raise SceneError(f"hand '{hand.name}' does not compile: {error}") from error
+    index = _index(compiled, _BARE_TASK, hand, None)
+    return Scene(compiled, index, _BARE_TASK, hand, "", ("ball/",))
 
 
 def hand_alone(scene: Scene) -> Scene:
-    """Return a scene in which nothing touches the objects, nor what they hang on.
+    """Return the scene with contacts of the objects, and of what they hang on, switched off.
 
-    They stay where they are in the model, so that its state has the same layout.
+    They remain in the model, so that its state has the same layout.
     """
     model = copy.deepcopy(scene.model)
     bodies = [model.body(i).name.startswith(scene.object_prefixes) for i in range(model.nbody)]
     of_object = np.array(bodies)[model.geom_bodyid]
     model.geom_contype[of_object] = model.geom_conaffinity[of_object] = 0
-    # Explicit contact pairs ignore contype: at a margin of -10 m they never produce force. The gap
-    # keeps them detected as before, since for some shapes MuJoCo takes a negative margin as depth.
+    # Explicit contact pairs ignore contype, but produce no force at a margin of -10 m. With the gap
+    # they are detected as before; for some shapes MuJoCo takes a negative margin as a depth.
     named = of_object[model.pair_geom1] | of_object[model.pair_geom2]
     model.pair_margin[named], model.pair_gap[named] = -_NEVER_M, _NEVER_M
     return replace(scene, model=model)
-
-
-def scale_mass(spec: mujoco.MjSpec, ratio: float) -> None:
-    """Scale mass and inertia of all bodies of a model that is yet to be compiled, in place.
-
-    Not in the compiled model: there ``mj_setConst`` leaves ``stat.meaninertia`` behind, on which
-    the solver's tolerance depends.
-    """
-    for geom in spec.geoms:
-        if np.isnan(geom.mass):
-            geom.density *= ratio
-        else:
-            geom.mass *= ratio
-    for body in spec.bodies:
-        if body.explicitinertial:
-            body.mass *= ratio
-            body.inertia = ratio * body.inertia
-            body.fullinertia = ratio * body.fullinertia
-
-
-def _load(file: Path) -> mujoco.MjSpec:
-    try:
-        return mujoco.MjSpec.from_file(str(file))
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise SceneError(
-            f"{file} is damaged ({reason}); 'pgdm assets verify' lists what else is, "
-            "'pgdm assets fetch' or 'pgdm assets import PATH' makes it anew"
-        ) from error
-
-
-def _place(spec: mujoco.MjSpec, placement: PlacementCfg) -> None:
-    body = spec.body(placement.body)
-    if body is None:
-        names = ", ".join(sorted(b.name for b in spec.bodies if b.name))
-        raise SceneError(f"no body '{placement.body}' to place; the scene has: {names}")
-    if placement.pos_m is not None:
-        body.pos = placement.pos_m
-    if placement.quat is not None:
-        body.quat = placement.quat
-
-
-def _randomized_geom(spec: mujoco.MjSpec, task: TaskCfg) -> str:
-    """Return the name of the first object's contact geom, and raise its contact priority."""
-    body = spec.body(task.tracked_body)
-    geoms = [] if body is None else [g for g in body.geoms if g.contype or g.conaffinity]
-    if len(geoms) != 1:
-        raise SceneError(f"task '{task.id}': randomize needs one contact geom, found {len(geoms)}")
-    geoms[0].priority = RANDOMIZED_PRIORITY
-    return geoms[0].name
 
 
 def _index(
@@ -276,18 +264,31 @@ def _index(
 
     points = [f"{hand.name}/{point}" for point in hand.points]
     mount = find(mujoco.mjtObj.mjOBJ_BODY, f"{hand.name}/{hand.mount_body}")
-    compensated = model.nu if hand.gravity_compensation == "all" else hand.num_base_joints
+    found = joint_actuators(model, hand)
+    driven, count = np.flatnonzero(found >= 0), len(found)
+    actuators = found[driven]
+    low, high = model.actuator_ctrlrange[actuators].T.copy()
+    joint_low, joint_high = model.jnt_range[:count].T.copy()
+    joint_low[driven], joint_high[driven] = low, high
+    compensated = count if hand.gravity_compensation == "all" else hand.num_base_joints
     geom = mujoco.mjtObj.mjOBJ_GEOM
     return SceneIndex(
         point_geoms=np.array([find(geom, p) for p in points]),
         point_bodies=np.array([find(mujoco.mjtObj.mjOBJ_BODY, p) for p in points]),
         object_body=find(mujoco.mjtObj.mjOBJ_BODY, task.tracked_body),
         fingertips=np.array(hand.fingertips),
+        num_joints=count,
         num_actuators=model.nu,
+        driven=driven,
+        actuators=actuators,
+        couplings=Couplings(model, count),
+        reset=reset_joints(model, hand, count),
         num_compensated=compensated,
         num_base_joints=hand.num_base_joints,
-        ctrl_low=model.actuator_ctrlrange[:, 0].copy(),
-        ctrl_high=model.actuator_ctrlrange[:, 1].copy(),
+        ctrl_low=low,
+        ctrl_high=high,
+        joint_low=joint_low,
+        joint_high=joint_high,
         mount_pos=model.body_pos[mount].copy(),
         mount_quat=model.body_quat[mount].copy(),
         randomized_geom=None if randomized is None else find(geom, randomized),

@@ -1,4 +1,4 @@
-"""Contact sheets: several states of one scene on one labelled picture."""
+"""Contact sheets: several states of one scene in one labelled image."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from pgdm.sim.scene import Scene
 PANEL = 640, 480  # pixels, width and height
 COLUMNS = 3
 _LABEL_HEIGHT, _TITLE_SIZE, _TEXT_SIZE, _MARGIN = 84, 22, 17, 10  # pixels
-_CHARACTERS = 72  # of the text that fit beside one another
+_CHARACTERS = 72  # per line of text
 _PAPER, _INK, _GREY = (255, 255, 255), (20, 20, 20), (90, 90, 90)
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture of a sheet."""
+    """One image of a sheet."""
 
     qpos: np.ndarray  # (nq,) m, rad
     title: str
     text: str
-    """Figures below the title, two lines at most."""
+    """Text below the title, at most two lines."""
 
 
 def write_sheet(scene: Scene, panels: Sequence[Panel], path: Path) -> Path:
-    """Write the panels as one PNG, all seen from the same place.
+    """Write the panels as one PNG, all from the same viewpoint.
 
     Raises:
         RenderError: if no OpenGL works here or the file cannot be written.
@@ -56,7 +56,7 @@ def write_sheet(scene: Scene, panels: Sequence[Panel], path: Path) -> Path:
 
 
 def _places(scene: Scene, panels: Sequence[Panel]) -> np.ndarray:
-    """Return what the pictures should show: object and middle of the hand, (2K, 3) m."""
+    """Return the points to keep in view: object and middle of the hand, (2K, 3) m."""
     data = mujoco.MjData(scene.model)
     places = []
     for panel in panels:

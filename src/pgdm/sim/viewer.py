@@ -1,10 +1,13 @@
-"""A window on a scene: MuJoCo's own viewer, for looking at motions."""
+"""Motions in a window, with MuJoCo's own viewer."""
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
+import threading
 import time
+import weakref
 from collections.abc import Sequence
 
 import mujoco
@@ -15,39 +18,87 @@ from pgdm.errors import RenderError
 from pgdm.sim.marks import add_marks
 from pgdm.sim.render import VIDEO_FPS
 
+_CLOSE_S = 5.0
+
 
 def show_motion(
     model: mujoco.MjModel, qpos: np.ndarray, marks: Sequence[np.ndarray] | None = None
 ) -> None:
-    """Replay joint positions in a window, again and again until it is closed.
+    """Replay joint positions in a window, in a loop until it is closed.
 
     Args:
         model: the compiled scene.
         qpos: joint positions (T, nq) at the control steps.
-        marks: points (n, 3) m to show as small spheres at each of them.
+        marks: points (n, 3) m to show as small spheres at each step.
 
     Raises:
-        RenderError: if there is no screen.
+        RenderError: if no window can be opened.
     """
-    if sys.platform.startswith("linux") and not _has_screen():
-        raise RenderError("there is no screen here to open a window on; use --video FILE")
-    data = mujoco.MjData(model)
+    window = Window(model, "--video FILE")
     try:
-        window = viewer.launch_passive(model, data, show_left_ui=False)
-    except RuntimeError as error:
-        raise RenderError(f"the window does not open ({error}); use --video FILE") from error
-    with window:
-        while window.is_running():
+        while window.is_open:
             for t, row in enumerate(qpos):
-                if not window.is_running():
+                if not window.is_open:
                     break
-                data.qpos[:] = row
-                mujoco.mj_forward(model, data)
-                if marks is not None:
-                    window.user_scn.ngeom = 0
-                    add_marks(window.user_scn, marks[t])
-                window.sync()
-                time.sleep(1 / VIDEO_FPS)
+                window.show(row, 1 / VIDEO_FPS, None if marks is None else marks[t])
+    finally:
+        window.close()
+
+
+class Window:
+    """A window of MuJoCo's viewer.
+
+    Args:
+        model: the compiled scene.
+        instead: what the user may do where no window can be opened, for the message.
+
+    Raises:
+        RenderError: if no window can be opened.
+    """
+
+    def __init__(self, model: mujoco.MjModel, instead: str) -> None:
+        if sys.platform.startswith("linux") and not _has_screen():
+            raise RenderError(f"no screen to open a window on; use {instead}")
+        self._model, self._data = model, mujoco.MjData(model)
+        self._shown_s = 0.0
+        before = set(threading.enumerate())
+        try:
+            self._viewer = viewer.launch_passive(model, self._data, show_left_ui=False)
+        except RuntimeError as error:
+            raise RenderError(f"cannot open a window ({error}); use {instead}") from error
+        own = set(threading.enumerate()) - before
+        self.close = weakref.finalize(self, _close, self._viewer, own)
+        """Closes it; also when the program ends, before the viewer's own exit handlers run."""
+        atexit.register(self.close)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it has not been closed, by the user or by ``close``."""
+        return self._viewer.is_running()
+
+    def show(self, qpos: np.ndarray, period_s: float, marks: np.ndarray | None = None) -> None:
+        """Show a state, no sooner than a time after the last one.
+
+        Args:
+            qpos: joint positions (nq,).
+            period_s: the least time between two states.
+            marks: points (n, 3) m to show as small spheres.
+        """
+        time.sleep(max(0.0, self._shown_s + period_s - time.monotonic()))
+        self._shown_s = time.monotonic()
+        with self._viewer.lock():
+            self._data.qpos[:] = qpos
+            mujoco.mj_forward(self._model, self._data)
+            if marks is not None:
+                self._viewer.user_scn.ngeom = 0
+                add_marks(self._viewer.user_scn, marks)
+        self._viewer.sync()
+
+
+def _close(window: viewer.Handle, threads: set[threading.Thread]) -> None:
+    window.close()
+    for thread in threads:  # a program that ends before them crashes
+        thread.join(_CLOSE_S)
 
 
 def _has_screen() -> bool:

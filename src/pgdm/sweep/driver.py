@@ -1,19 +1,20 @@
-"""Drives the jobs of a sweep from one process: starts workers, sees how they end, starts others."""
+"""Drives the jobs of a sweep from one process: starts workers and follows each to its end."""
 
 from __future__ import annotations
 
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
-from pgdm.config.saved import load_config
-from pgdm.errors import ConfigError, RunError, SweepError
+from pgdm.errors import SweepError
+from pgdm.runs.folder import RunFolder
 from pgdm.stop import STOPPED, StopRequest
-from pgdm.sweep.launcher import Ended, Launcher, Task
+from pgdm.sweep.front import Front
+from pgdm.sweep.launcher import Assignment, Ended, Launcher
 from pgdm.sweep.ledger import (
     CANCELLED,
     FAILED,
@@ -27,52 +28,49 @@ from pgdm.sweep.ledger import (
     Ledger,
 )
 from pgdm.sweep.mirror import SweepMirror
-from pgdm.sweep.plan import Job, Plan, job_key
+from pgdm.sweep.plan import Job, Plan
 from pgdm.sweep.processes import Process
-from pgdm.sweep.state import NAME, PARENT, SLOTS, log_path, rows, settle, stand, works
-from pgdm.sweep.view import SweepView, failures
-from pgdm.tracking.run_folder import RunFolder
+from pgdm.sweep.repair import holds, job_ending, recall
+from pgdm.sweep.status import NAME, PARENT, SLOTS, log_path, run_ending, settle, works
 
 _STOP_S = 60.0
 """How long workers may take to save when the sweep itself fails."""
-_AGAIN_S = 60.0
-"""How long to wait after a launcher has refused, while others are at work."""
-
-Notify = Callable[[str], None]
+_RETRY_S = 60.0
+"""How long to wait after a launcher has refused jobs, while others run."""
 
 
 @dataclass
 class _Worker:
-    """A process at work on a job, or about to be."""
+    """A process that works on a job, or is about to."""
 
-    task: Task
+    assignment: Assignment
     frames: int
-    """How far the job was before."""
+    """Frames of the job when this driver started the worker or took it over."""
     asked: bool = False
     """Whether it was asked to stop."""
 
 
 class Driver:
-    """Drives a plan; the caller keeps other drivers away.
+    """Drives a plan; the caller must hold the sweep's lock.
 
     Args:
         plan: the jobs.
         max_attempts: how often a job is tried.
         launcher: starts workers.
-        notify: told in a sentence what people should know.
+        front: shows the sweep's state to the user.
     """
 
-    def __init__(self, plan: Plan, max_attempts: int, launcher: Launcher, notify: Notify) -> None:
-        self._plan, self._max_attempts, self._notify = plan, max_attempts, notify
+    def __init__(self, plan: Plan, max_attempts: int, launcher: Launcher, front: Front) -> None:
+        self._plan, self._max_attempts, self._notify = plan, max_attempts, front.notify
         self._launcher = launcher
         self._jobs = {job.key: job for job in plan.jobs}
         self._ledger = Ledger(plan.folder)
-        self._mirror = SweepMirror.of(plan, notify)
-        self._view = SweepView(plan.name, self._ledger, launcher.queue)
+        self._mirror = SweepMirror.of(plan, front.notify)
+        self._view = front.view(plan.name, self._ledger, launcher.queue)
         self._tries: Counter[str] = Counter()
         self._workers: list[_Worker] = []
         self._left_over: list[Entry] = []
-        self._told_busy: set[str] = set()
+        self._reported_busy: set[str] = set()
         self._not_before_s = 0.0
 
     def run(self, stop: StopRequest) -> int:
@@ -93,17 +91,17 @@ class Driver:
         stopped = stop() and not whole
         self._mirror.close(FINISHED if whole else INTERRUPTED if stopped else FAILED)
         self._notify(self._view.line())
-        if text := failures(rows(self._ledger, self._launcher.queue)):
+        if text := self._view.failures():
             self._notify(text)
         if self._workers:
             self._notify(
-                "the jobs go on without this process: the same command looks after them again, "
-                f"pgdm sweep cancel {self._plan.folder} ends them"
+                "the jobs continue without this process; the same command monitors them again, "
+                f"pgdm sweep cancel {self._plan.folder} stops them"
             )
         return stop.exit_code if stopped else int(not whole)
 
     def _prepare(self) -> None:
-        """Bring the ledger to what the run folders tell, and MLflow to a start."""
+        """Bring the ledger in line with the run folders, and open the sweep in MLflow."""
         ledger, me = self._ledger, Process.of(os.getpid())
         recall(ledger, self._plan)
         ledger.set_fact(NAME, self._plan.name)
@@ -122,19 +120,21 @@ class Driver:
         ledger.set_states(states)
 
     def _adopt(self, entry: Entry, attempt: Attempt) -> None:
-        """Look after a worker that another driver has left, or at least wait for its end."""
+        """Follow a worker that another driver has left, or at least wait for its exit."""
         job = self._jobs.get(entry.key)
-        if job is not None and self._launcher.adopt(task := Task(job, attempt.number), attempt):
+        if job is not None and self._launcher.adopt(
+            assignment := Assignment(job, attempt.number), attempt
+        ):
             self._tries[job.key] += 1
-            self._workers.append(_Worker(task, _frames(job)))
+            self._workers.append(_Worker(assignment, _frames(job)))
         else:
             self._left_over.append(entry)
 
     def _first_state(self, entry: Entry) -> str:
         """Return whether a job is finished or waits; the folder decides, not the ledger."""
         job = self._jobs[entry.key]
-        done = _stand(job).state == FINISHED
-        known = entry.state == FINISHED or (done and _holds(job))
+        done = job_ending(job).state == FINISHED
+        known = entry.state == FINISHED or (done and holds(job))
         return FINISHED if done and known else WAITING
 
     def _loop(self, stop: StopRequest) -> None:
@@ -143,10 +143,12 @@ class Driver:
             if stop() and self._launcher.stays:
                 return
             if stop():
-                self._left_over.clear()  # they have been stopping since their own driver went
+                self._left_over.clear()  # they have been stopping since their own driver died
             self._take_over()
             states = self._ledger.states()
-            self._ask([w for w in self._workers if stop() or states[w.task.job.key] == CANCELLED])
+            self._ask(
+                [w for w in self._workers if stop() or states[w.assignment.job.key] == CANCELLED]
+            )
             waiting = [j for j in self._plan.jobs if states[j.key] == WAITING and not stop()]
             more = self._launcher.more(len(self._workers) + len(self._left_over))
             if time.monotonic() >= self._not_before_s:
@@ -158,16 +160,16 @@ class Driver:
 
     def _ask(self, workers: Sequence[_Worker]) -> None:
         """Ask workers to save and stop, each of them once."""
-        if tasks := [worker.task for worker in workers if not worker.asked]:
-            self._launcher.ask(tasks)
+        if assignments := [worker.assignment for worker in workers if not worker.asked]:
+            self._launcher.ask(assignments)
         for worker in workers:
             worker.asked = True
 
     def _is_free(self, job: Job) -> bool:
-        """Return whether nobody else works in a job's folder; tell about it once."""
+        """Return whether no other process works in a job's folder; report a busy one once."""
         busy = RunFolder(Path(job.cfg.run_dir)).busy
-        if busy and job.key not in self._told_busy:
-            self._told_busy.add(job.key)
+        if busy and job.key not in self._reported_busy:
+            self._reported_busy.add(job.key)
             self._notify(f"{job.name}: another process is using {job.cfg.run_dir}; waiting for it")
         return not busy
 
@@ -178,39 +180,39 @@ class Driver:
         me = Process.of(os.getpid())
         for job in jobs:
             self._mirror.adopt(job)
-        tasks = [Task(job, self._ledger.begin(job.key, me)) for job in jobs]
+        assignments = [Assignment(job, self._ledger.begin(job.key, me)) for job in jobs]
         try:
-            self._launcher.start(tasks)
+            self._launcher.start(assignments)
         except SweepError as error:
-            self._refused(tasks, error)
+            self._refused(assignments, error)
             return
-        for task in tasks:
-            if self._tries[task.job.key] >= self._max_attempts:
-                self._tries[task.job.key] = 0  # somebody asked for it anew
-            self._tries[task.job.key] += 1
-            self._workers.append(_Worker(task, _frames(task.job)))
+        for assignment in assignments:
+            if self._tries[assignment.job.key] >= self._max_attempts:
+                self._tries[assignment.job.key] = 0  # used up, so `sweep retry` set it to waiting
+            self._tries[assignment.job.key] += 1
+            self._workers.append(_Worker(assignment, _frames(assignment.job)))
 
-    def _refused(self, tasks: Sequence[Task], error: SweepError) -> None:
-        """Note that workers could not be started; what is at work meanwhile is a reason to wait."""
-        for task in tasks:
-            found = _stand(task.job)
-            self._ledger.end(*task.id, replace(found, state=FAILED, error=str(error)))
-        self._ledger.set_states({task.job.key: WAITING for task in tasks})
+    def _refused(self, assignments: Sequence[Assignment], error: SweepError) -> None:
+        """Note that workers could not be started; while others run, try again later."""
+        for assignment in assignments:
+            found = job_ending(assignment.job)
+            self._ledger.end(*assignment.id, replace(found, state=FAILED, error=str(error)))
+        self._ledger.set_states({assignment.job.key: WAITING for assignment in assignments})
         if not self._workers:
             raise error
-        self._notify(f"{error}; trying again in {_AGAIN_S:.0f} s")
-        self._not_before_s = time.monotonic() + _AGAIN_S
+        self._notify(f"{error}; trying again in {_RETRY_S:.0f} s")
+        self._not_before_s = time.monotonic() + _RETRY_S
 
     def _reap(self) -> None:
-        """See which workers have ended, and how."""
-        found = [(worker, self._launcher.ended(worker.task)) for worker in self._workers]
+        """Find the workers that have exited, and note how."""
+        found = [(worker, self._launcher.ended(worker.assignment)) for worker in self._workers]
         for worker, ended in found:
             if ended is None:
                 continue
             self._workers.remove(worker)
-            job, key = worker.task.job, worker.task.job.key
+            job, key = worker.assignment.job, worker.assignment.job.key
             ending = self._ending(worker, ended)
-            self._ledger.end(*worker.task.id, ending)
+            self._ledger.end(*worker.assignment.id, ending)
             if ended.code != 0:
                 self._mirror.correct(Path(job.cfg.run_dir))
             if ended.displaced and (ending.frames or 0) > worker.frames:
@@ -221,34 +223,34 @@ class Driver:
                 state = INTERRUPTED
             else:
                 state = WAITING if self._tries[key] < self._max_attempts else FAILED
-                number = worker.task.number
+                number = worker.assignment.number
                 self._notify(f"{job.name}: attempt {number} {ending.state}: {ending.error}")
             self._ledger.set_states({key: state})
 
     def _ending(self, worker: _Worker, ended: Ended) -> Ending:
-        """Return how an attempt ended, by what run folder, exit code and log tell."""
-        code, job = ended.code, worker.task.job
-        found = _stand(job)
-        if found.state == FINISHED and _holds(job):
+        """Return how an attempt ended, from run folder, exit code and log."""
+        code, job = ended.code, worker.assignment.job
+        found = job_ending(job)
+        if found.state == FINISHED and holds(job):
             state, error = FINISHED, None
         elif ended.error is not None:
             state = INTERRUPTED if worker.asked or ended.displaced else FAILED
             error = ended.error
         elif code in STOPPED or code == 0:
-            state, error = INTERRUPTED, "stopped from outside"
+            state, error = INTERRUPTED, "stopped by a signal"
         else:
-            log = log_path(self._plan.folder, job.name, worker.task.number)
+            log = log_path(self._plan.folder, job.name, worker.assignment.number)
             state, error = FAILED, _last_error(log)
         return Ending(state, code, found.frames, found.metrics, error)
 
     def _take_over(self) -> None:
-        """Take over the jobs whose workers a killed driver left, once these have ended."""
+        """Take over the jobs of a killed driver once the workers that it left have exited."""
         for entry in list(self._left_over):
             assert entry.last is not None
             if works(entry.last, entry.run_dir, self._launcher.queue):
                 continue
             self._left_over.remove(entry)
-            ending = stand(entry.run_dir, entry.total_frames)
+            ending = run_ending(entry.run_dir, entry.total_frames)
             self._ledger.end(entry.key, entry.last.number, ending)
             self._mirror.correct(entry.run_dir)
             if ending.state == FINISHED or entry.key not in self._jobs:
@@ -257,38 +259,13 @@ class Driver:
                 self._ledger.set_states({entry.key: WAITING})
 
 
-def recall(ledger: Ledger, plan: Plan) -> None:
-    """Note a plan's jobs in a ledger, and of those it does not know yet what their folders tell."""
-    ledger.add(plan)
-    jobs = {job.key: job for job in plan.jobs}
-    for entry in ledger.entries():
-        job, folder = jobs.get(entry.key), RunFolder(entry.run_dir)
-        if job is None or entry.last is not None or folder.busy or not _holds(job):
-            continue
-        ending = _stand(job)
-        ledger.recall(entry.key, folder.started(), folder.modified(), ending)
-        ledger.set_states({entry.key: ending.state})
-
-
-def _stand(job: Job) -> Ending:
-    return stand(Path(job.cfg.run_dir), job.cfg.total_frames, job.cfg.time_limit_min)
-
-
 def _frames(job: Job) -> int:
-    """Return how far a job is, environment steps."""
-    return _stand(job).frames or 0
-
-
-def _holds(job: Job) -> bool:
-    """Return whether a job's folder holds its run, and no other one."""
-    try:
-        return job_key(load_config(job.cfg.run_dir)) == job.key
-    except (RunError, ConfigError):
-        return False  # its worker says what is wrong
+    """Return how far a job is, frames."""
+    return job_ending(job).frames or 0
 
 
 def _last_error(log: Path) -> str:
-    """Return the last error that a log tells, or its last line."""
+    """Return the last error in a log, or its last line."""
     text = log.read_text(errors="replace") if log.exists() else ""
     lines = [line for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("error: ")]

@@ -1,20 +1,23 @@
-"""What a plan will cost, from what is done already and how fast earlier runs were."""
+"""What a plan will cost, from its progress so far and the speed of earlier runs."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from pgdm.errors import RunError
+from pgdm.library.progress import StepProgress, silent
+from pgdm.runs.files import RESULT, read_json
+from pgdm.runs.folder import RunFolder, find_runs
 from pgdm.sweep.ledger import FINISHED
 from pgdm.sweep.plan import Job, Plan
-from pgdm.sweep.state import stand
-from pgdm.tracking.run_folder import RESULT, RunFolder, find_runs, read_json
+from pgdm.sweep.status import run_ending
 
 _NEWEST = 50
-"""So many earlier runs are asked at most."""
+"""Most earlier runs to look at."""
 
 
 @dataclass(frozen=True)
@@ -24,28 +27,32 @@ class Estimate:
     finished: int
     """Jobs that are finished."""
     begun: int
-    """Jobs that were begun, and go on."""
+    """Jobs that were begun, and will resume."""
     frames_left: int
-    """Environment steps to do."""
+    """Frames left."""
     steps_per_s: float
-    """Of one job at a time, collecting and learning."""
+    """Speed of a job that runs alone, collecting and learning."""
     measured_runs: int
-    """Earlier runs that the speed was measured in; 0: it is assumed."""
+    """Earlier runs in which the speed was measured; 0: it is assumed."""
 
     @property
     def hours(self) -> float:
-        """Time for what is left, one job after the other [h]."""
+        """Time for the rest, one job after the other [h]."""
         return self.frames_left / self.steps_per_s / 3600
 
 
-def estimate(plan: Plan, root: Path) -> Estimate:
-    """Look at the run folders of a plan, and at the earlier runs below a folder.
+def estimate(plan: Plan, root: Path, progress: StepProgress = silent) -> Estimate:
+    """Estimate from the run folders of a plan, and from earlier runs in a folder.
 
     Args:
         plan: the jobs.
         root: folder of runs.
+        progress: called with the number of jobs looked at so far.
     """
-    done = [_frames_done(job) for job in plan.jobs]
+    done = []
+    for job in plan.jobs:
+        progress("reading earlier runs", len(done), len(plan.jobs))
+        done.append(_frames_done(job))
     left = [max(0, job.cfg.total_frames - d) for job, d in zip(plan.jobs, done, strict=True)]
     speeds = _speeds(plan, root)
     return Estimate(
@@ -58,23 +65,23 @@ def estimate(plan: Plan, root: Path) -> Estimate:
 
 
 def _frames_done(job: Job) -> int:
-    """Return how far a job is; at most its last frame but one as long as it has not ended well."""
+    """Return the frames of a job so far; fewer than all of them until it is finished."""
     total = job.cfg.total_frames
     try:
-        found = stand(Path(job.cfg.run_dir), total, job.cfg.time_limit_min)
-    except RunError:  # starting it will tell
+        found = run_ending(Path(job.cfg.run_dir), total, job.cfg.time_limit_min)
+    except RunError:  # reported when it starts
         return 0
     return total if found.state == FINISHED else min(found.frames or 0, total - 1)
 
 
 def _speeds(plan: Plan, root: Path) -> list[float]:
-    """Return the steps a second of the earlier runs that are most like the plan's."""
+    """Return the steps a second of the earlier runs most similar to the plan's."""
     runs = [run for run in find_runs(root) if (run.path / RESULT).exists()]
     runs.sort(key=lambda run: (run.path / RESULT).stat().st_mtime)
     rows = []
     for run in runs[-_NEWEST:]:
         speed = read_json(run.path / RESULT).get("steps_per_s")
-        if isinstance(speed, int | float) and speed > 0:
+        if isinstance(speed, int | float) and 0 < speed < math.inf:
             rows.append((_kind(run), float(speed)))
     kinds = {
         (j.cfg.algo.name, j.cfg.num_envs, j.cfg.device, j.cfg.action.kind, j.cfg.task.id)

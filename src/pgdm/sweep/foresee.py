@@ -1,51 +1,57 @@
-"""What the runs of a sweep would meet in this machine's assets, told before any of them starts."""
+"""What the runs of a sweep lack in this machine's assets, reported before any of them starts."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 from pgdm.config.schema import ExperimentCfg
-from pgdm.experiment import foreseen, wanted_start
-from pgdm.library import Library, figures, rebuild
+from pgdm.library import Library
+from pgdm.library.progress import StepProgress, silent
+from pgdm.library.tasks import CHECKOUT_TASKS, REBUILT_EXPERTS
 from pgdm.methods import recipe
 from pgdm.pregrasp.sources import stored_source
 
 
-def foresee(cfgs: Iterable[ExperimentCfg], library: Library) -> list[str]:
-    """Return sentences on starts and assets that are not as asked for.
+def foresee(
+    cfgs: Sequence[ExperimentCfg], library: Library, progress: StepProgress = silent
+) -> list[str]:
+    """Return sentences on start states and assets that differ from what the runs ask for.
 
     Args:
-        cfgs: of the runs.
-        library: nothing is fetched or made for it here.
+        cfgs: settings of the runs.
+        library: nothing is fetched or generated for it here.
+        progress: called with the number of runs looked at so far.
 
     Raises:
-        ConfigError: if the start of a run is missing, and would not be made.
+        ConfigError: if a start state is missing, and is not generated automatically.
     """
     replaced: Counter[tuple[str, str]] = Counter()
+    used_by: dict[object, str] = {}
     lacking, approximate, planned = set(), set(), set()
-    for cfg in cfgs:
+    for number, cfg in enumerate(cfgs):
+        progress("looking for their assets", number, len(cfgs))
         motion = cfg.task.motion
         if cfg.action.plans_wrist:
             planned.add(motion)
-        if recipe(cfg.method).needs_expert and motion in rebuild.TASKS:
+        if recipe(cfg.method).needs_expert and motion in REBUILT_EXPERTS:
             approximate.add(motion)
         if motion not in library.tasks():
-            lacking |= {motion} & set(figures.OTHER_TASKS)
-        elif cfg.pregrasp.source != "none" and not wanted_start(cfg, library).can_be_made:
-            used = stored_source(cfg.pregrasp, library.motion(motion), cfg.task.id, cfg.hand.name)
-            if used is None:
-                foreseen(cfg, library)  # raises with the cure
-            elif used != cfg.pregrasp.source:
-                replaced[cfg.pregrasp.source, used] += 1
+            lacking |= {motion} & set(CHECKOUT_TASKS)
+        elif (source := cfg.pregrasp.source) != "none":
+            start = cfg.task.id, motion, cfg.hand.name, cfg.pregrasp
+            if start not in used_by:
+                used_by[start] = _used(cfg, library)
+            if used_by[start] != source:
+                replaced[source, used_by[start]] += 1
     found = [
         f"{count} runs with pregrasp={source} start from '{used}', as the assets here have no "
-        f"'{source}' of their tasks (a TCDM checkout has, and 'pgdm pregrasp reach TASK' plans one)"
+        f"'{source}' for their tasks (a TCDM checkout has, or 'pgdm pregrasp reach TASK' plans one)"
         for (source, used), count in replaced.items()
     ]
     if planned:
         found.append(
-            f"the wrist is planned in {len(planned)} tasks: a run whose plan the library lacks "
+            f"{len(planned)} tasks have a wrist plan: a run whose plan the library lacks "
             "computes it first, 10-40 s each"
         )
     if lacking:
@@ -55,3 +61,22 @@ def foresee(cfgs: Iterable[ExperimentCfg], library: Library) -> list[str]:
         names = ", ".join(sorted(approximate))
         found.append(f"the expert hands of these tasks are rebuilt, and approximate: {names}")
     return found
+
+
+def _used(cfg: ExperimentCfg, library: Library) -> str:
+    """Return the source of the start state that a run will use.
+
+    Raises:
+        ConfigError: if there is none; the message names the command that generates one.
+    """
+    source = cfg.pregrasp.source
+    used = stored_source(cfg.pregrasp, library.motion(cfg.task.motion), cfg.task.id, cfg.hand.name)
+    if used == source:
+        return source
+    from pgdm.experiment import foreseen, wanted_start  # slow to import, and seldom needed
+
+    if wanted_start(cfg, library).can_be_made:
+        return source
+    if used is None:
+        foreseen(cfg, library)
+    return str(used)

@@ -1,4 +1,4 @@
-"""What drives a sweep and what starts its workers: the contract between the two."""
+"""The contract between what drives a sweep and what starts its workers."""
 
 from __future__ import annotations
 
@@ -12,48 +12,48 @@ from pgdm.sweep.queue import Queue
 
 
 @dataclass(frozen=True)
-class Task:
-    """One attempt at a job, to be made by a process of its own."""
+class Assignment:
+    """One attempt at a job, done by a process of its own."""
 
     job: Job
     number: int
-    """Of the attempt."""
+    """Number of the attempt."""
 
     @property
     def id(self) -> tuple[str, int]:
-        """What tells it from all others."""
+        """Its identity: key of the job and number of the attempt."""
         return self.job.key, self.number
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a worker ended."""
+    """How a worker exited."""
 
     code: int | None
-    """Its exit code, or minus the signal that ended it; None if nobody knows."""
+    """Its exit code, or minus the signal that killed it; None if unknown."""
     error: str | None = None
-    """What ended it, if it was not itself."""
+    """What killed it, if anything did."""
     displaced: bool = False
-    """Whether it had to make room: that is no failure."""
+    """Whether it was preempted or ran out of time, which is no failure."""
 
 
 class Launcher(Protocol):
-    """Starts workers somewhere, and knows how they end."""
+    """Starts workers somewhere, and learns how they exit."""
 
     slots: int
     """How many jobs run at a time."""
     tick_s: float
-    """How often to look after the workers, s."""
+    """Time between two looks at the workers, s."""
     stays: bool
-    """Whether workers go on when their driver ends."""
+    """Whether workers continue when their driver exits."""
     queue: Queue
-    """Where workers of a Slurm cluster stand."""
+    """States of the workers on a Slurm cluster."""
 
     def more(self, working: int) -> int:
-        """Return how many jobs may be started beside those that are at work."""
+        """Return how many jobs may be started in addition to those that run."""
         ...
 
-    def start(self, tasks: Sequence[Task]) -> None:
+    def start(self, assignments: Sequence[Assignment]) -> None:
         """Start workers.
 
         Raises:
@@ -61,18 +61,18 @@ class Launcher(Protocol):
         """
         ...
 
-    def adopt(self, task: Task, attempt: Attempt) -> bool:
-        """Look after a worker that another driver has left, and return whether that is possible."""
+    def adopt(self, assignment: Assignment, attempt: Attempt) -> bool:
+        """Follow a worker that another driver has left, and return whether that is possible."""
         ...
 
-    def ended(self, task: Task) -> Ended | None:
-        """Return how a worker ended; None while it is at work."""
+    def ended(self, assignment: Assignment) -> Ended | None:
+        """Return how a worker exited; None while it runs."""
         ...
 
-    def ask(self, tasks: Sequence[Task]) -> None:
+    def ask(self, assignments: Sequence[Assignment]) -> None:
         """Ask workers to save and stop."""
         ...
 
     def end(self, patience_s: float) -> None:
-        """End all workers that do not stay: let them save first, but not longer than this."""
+        """Stop all workers that do not stay; kill those that take longer than this to save, s."""
         ...

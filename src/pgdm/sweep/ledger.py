@@ -1,7 +1,7 @@
-"""What a sweep did: every attempt at every job, in an SQLite file in the sweep's folder.
+"""The record of a sweep: every attempt at every job, in an SQLite file in the sweep's folder.
 
-Any number of processes read and write it, and any of them may be killed at any moment. What a job
-has reached is told by its run folder; a ledger that is lost is made again from there.
+Any number of processes read and write it, and any of them may be killed at any moment. The progress
+of a job is in its run folder; a lost ledger is rebuilt from there.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from pgdm.errors import SweepError
 from pgdm.sweep.processes import Process
 
 if TYPE_CHECKING:
-    from pgdm.sweep.plan import Plan
+    from pgdm.sweep.plan import Job, Plan
 
 FILE = "ledger.sqlite"
 WAITING, RUNNING, FINISHED = "waiting", "running", "finished"
 FAILED, INTERRUPTED, CANCELLED = "failed", "interrupted", "cancelled"
 STATES = (WAITING, RUNNING, FINISHED, FAILED, INTERRUPTED, CANCELLED)
-"""Of a job; of an attempt: running, finished, failed or interrupted."""
+"""States of a job; an attempt is running, finished, failed or interrupted."""
 LOCK_S = 120.0
-"""How long a locked ledger is tried again."""
+"""How long to retry when the ledger is locked, s."""
 
-# A rollback journal and not a write-ahead log, which needs memory that all writers share.
+# With a rollback journal: a write-ahead log needs memory that all writers share.
 _SCHEMA = """
 BEGIN IMMEDIATE;
 CREATE TABLE IF NOT EXISTS jobs (
@@ -60,12 +60,12 @@ class Attempt:
     end: float | None = None
     exit_code: int | None = None
     frames: int | None = None
-    """How far the run was at the end, environment steps."""
+    """Progress of the run at the end, frames."""
     metrics: Mapping[str, float] | None = None
     """Its last evaluation."""
     error: str | None = None
     slurm_id: str | None = None
-    """Slurm's name of the job that makes it, if one does."""
+    """Slurm's ID of its job, if it is one."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,12 @@ class Ending:
 
 
 class Ledger:
-    """The ledger of the sweep in a folder; the file is made if it is missing.
+    """The ledger of the sweep in a folder; the file is created if it is missing.
 
-    Each method is one transaction: it is done whole or not at all. A ledger that is locked is
-    tried again for ``LOCK_S``.
+    Each method is one transaction. While the ledger is locked, it retries for ``LOCK_S``.
 
     Args:
-        folder: of the sweep.
+        folder: folder of the sweep.
 
     Raises:
         SweepError: from every method, if the file cannot be read or written.
@@ -110,9 +109,9 @@ class Ledger:
         self._do(lambda db: db.executescript(_SCHEMA) if _is_empty(db) else None)
 
     def add(self, plan: Plan) -> None:
-        """Note a plan's jobs; those that are known keep their state and attempts."""
+        """Add a plan's jobs; known ones keep their state and attempts."""
         rows = [
-            (job.key, place, job.name, self._shown(Path(job.cfg.run_dir)), job.cfg.total_frames)
+            (job.key, place, job.name, run_dir_in(self.folder, job), job.cfg.total_frames)
             for place, job in enumerate(plan.jobs)
         ]
         self._write(
@@ -144,7 +143,7 @@ class Ledger:
         return [_attempt(row) for row in self._read("SELECT * FROM attempts ORDER BY key, number")]
 
     def begin(self, key: str, process: Process) -> int:
-        """Note that an attempt begins, and return its number."""
+        """Record the start of an attempt, and return its number."""
 
         def work(db: sqlite3.Connection) -> int:
             db.execute("BEGIN IMMEDIATE")
@@ -154,7 +153,7 @@ class Ledger:
                 "FROM attempts WHERE key = ?1 RETURNING number",
                 (key, process.host, process.pid, process.born, time.time()),
             ).fetchall()
-            # Cancelled in this moment: its driver sees that, and stops it again.
+            # Cancelled meanwhile: its driver sees that, and stops it.
             db.execute(
                 "UPDATE jobs SET state = 'running' WHERE key = ? AND state != 'cancelled'", (key,)
             )
@@ -164,8 +163,8 @@ class Ledger:
         return self._do(work)
 
     def submitted(self, slurm_ids: Mapping[tuple[str, int], str]) -> None:
-        """Note which of Slurm's jobs make which attempts: a key and a number each."""
-        # The process was their driver's; what runs already has noted more.
+        """Record which of Slurm's jobs are which attempts, each by key and number."""
+        # So far their process is the driver; one that runs already has registered itself.
         self._write(
             "UPDATE attempts SET slurm_id = ?, host = '', pid = 0, born = '' "
             "WHERE key = ? AND number = ? AND slurm_id IS NULL",
@@ -175,7 +174,7 @@ class Ledger:
     def register(
         self, key: str, number: int, process: Process, slurm_id: str | None = None
     ) -> bool:
-        """Note which process works on an attempt; false if it has been given up meanwhile."""
+        """Record which process works on an attempt; false if it was given up meanwhile."""
         changed = self._write(
             "UPDATE attempts SET host = ?, pid = ?, born = ?, slurm_id = ? "
             "WHERE key = ? AND number = ? AND state = 'running'",
@@ -184,26 +183,16 @@ class Ledger:
         return changed == 1
 
     def end(self, key: str, number: int, ending: Ending) -> None:
-        """Note how an attempt ended; what was noted before stays."""
+        """Record how an attempt ended; an earlier record of that stays."""
+        found = ending.exit_code, ending.frames, json.dumps(ending.metrics), ending.error
         self._write(
             "UPDATE attempts SET state = ?, end = ?, exit_code = ?, frames = ?, metrics = ?, "
             "error = ? WHERE key = ? AND number = ? AND state = 'running'",
-            [
-                (
-                    ending.state,
-                    time.time(),
-                    ending.exit_code,
-                    ending.frames,
-                    json.dumps(ending.metrics),
-                    ending.error,
-                    key,
-                    number,
-                )
-            ],
+            [(ending.state, time.time(), *found, key, number)],
         )
 
     def recall(self, key: str, start: float, end: float, ending: Ending) -> None:
-        """Note a past attempt that only the run folder tells of."""
+        """Record a past attempt that is only known from its run folder."""
         row = (key, ending.state, start, end, ending.frames, json.dumps(ending.metrics))
         self._write(
             "INSERT OR IGNORE INTO attempts (key, number, state, host, pid, born, start, end, "
@@ -217,24 +206,19 @@ class Ledger:
         self._write("UPDATE jobs SET state = ? WHERE key = ?", rows)
 
     def fact(self, name: str) -> Any:
-        """Return something that is known of the sweep as a whole, or None."""
+        """Return a fact about the sweep as a whole, or None."""
         rows = self._read("SELECT value FROM facts WHERE name = ?", (name,))
         return json.loads(rows[0][0]) if rows else None
 
     def set_fact(self, name: str, value: Any) -> None:
-        """Note something about the sweep as a whole."""
+        """Record a fact about the sweep as a whole."""
         self._write("INSERT OR REPLACE INTO facts VALUES (?, ?)", [(name, json.dumps(value))])
-
-    def _shown(self, run_dir: Path) -> str:
-        """Return a run's folder as the ledger names it, so that a sweep may be moved as a whole."""
-        inside = run_dir.is_relative_to(self.folder)
-        return str(run_dir.relative_to(self.folder) if inside else run_dir)
 
     def _read(self, query: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         return self._do(lambda db: db.execute(query, values).fetchall())
 
     def _write(self, query: str, rows: Iterable[tuple[Any, ...]]) -> int:
-        """Do a query for each row, all or nothing; return the rows changed."""
+        """Run a query for each row in one transaction; return the number of rows changed."""
         wanted = list(rows)
 
         def work(db: sqlite3.Connection) -> int:
@@ -246,7 +230,7 @@ class Ledger:
         return self._do(work)
 
     def _do(self, work: Callable[[sqlite3.Connection], T]) -> T:
-        """Do work on a connection of its own: nothing is held open, and nothing left half done."""
+        """Do work on a connection of its own, so that nothing stays open."""
         limit = time.monotonic() + LOCK_S
         while True:
             try:
@@ -257,14 +241,20 @@ class Ledger:
                     raise SweepError(_explained(self.path, error)) from error
                 if time.monotonic() > limit:
                     raise SweepError(
-                        f"{self.path} has been locked by another program for {LOCK_S:.0f} s; end "
-                        "that program, then start the same command again: nothing is lost"
+                        f"{self.path} has been locked by another program for {LOCK_S:.0f} s; close "
+                        "that program, then run the same command again (nothing is lost)"
                     ) from error
             time.sleep(_RETRY_S)
 
 
+def run_dir_in(folder: Path, job: Job) -> str:
+    """Return a job's folder as stored: relative if inside, so that a sweep can be moved."""
+    path = Path(job.cfg.run_dir)
+    return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
+
+
 def _connect(path: Path) -> sqlite3.Connection:
-    # Short waits inside SQLite, so that a second Ctrl-C gets through.
+    # Short waits inside SQLite, so that a second Ctrl-C is noticed.
     return sqlite3.connect(path, timeout=0.5, isolation_level=None)
 
 
@@ -276,12 +266,12 @@ def _explained(path: Path, error: sqlite3.Error) -> str:
     text = str(error)
     if "full" in text or "disk I/O" in text:
         return (
-            f"cannot write {path}: {text}; make room and start the same command again: what the "
-            "jobs have reached is in their run folders"
+            f"cannot write {path}: {text}; make room and run the same command again (the progress "
+            "of the jobs is in their run folders)"
         )
     if isinstance(error, sqlite3.OperationalError):
         return f"cannot use {path}: {text}; check that its folder exists and may be written"
-    return f"{path} is damaged ({text}); remove it: it is made again from the run folders"
+    return f"{path} is damaged ({text}); remove it, and it is rebuilt from the run folders"
 
 
 def _attempt(row: tuple[Any, ...]) -> Attempt:

@@ -1,4 +1,4 @@
-"""Workers on this machine: a process for each job, as many at a time as there is room for."""
+"""Workers on this machine: a process for each job, as many at a time as fit."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
-from pathlib import Path
 
-from pgdm.sweep.launcher import Ended, Task
+from pgdm.memory import free_bytes
+from pgdm.sweep.launcher import Assignment, Ended
 from pgdm.sweep.ledger import Attempt
 from pgdm.sweep.plan import LocalCfg, Plan
 from pgdm.sweep.queue import Queue
-from pgdm.sweep.state import log_path
+from pgdm.sweep.status import log_path
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Room:
     slots: int
     """Jobs at a time."""
     threads: int
-    """Of each job that does not say so itself."""
+    """Threads of each job that does not set them itself."""
 
 
 def room(plan: Plan, launcher: LocalCfg, cores: int, memory_gb: float) -> Room:
@@ -37,7 +36,7 @@ def room(plan: Plan, launcher: LocalCfg, cores: int, memory_gb: float) -> Room:
     Args:
         plan: the jobs.
         launcher: limits.
-        cores: of the machine.
+        cores: number of cores of the machine.
         memory_gb: free memory, GB.
     """
     asked = launcher.cores_per_job or max((job.cfg.num_threads for job in plan.jobs), default=0)
@@ -48,72 +47,73 @@ def room(plan: Plan, launcher: LocalCfg, cores: int, memory_gb: float) -> Room:
     return Room(slots, asked or max(1, cores // slots))
 
 
-def free_memory_gb() -> float:
-    """Return how much memory new processes can have, GB."""
-    lines = Path("/proc/meminfo").read_text().splitlines()
-    fields = dict(line.split(":", 1) for line in lines)
-    return int(fields["MemAvailable"].split()[0]) / 1e6
-
-
 class LocalLauncher:
-    """Starts workers on this machine; as ``Launcher`` says.
+    """Starts workers on this machine; see ``Launcher``.
 
     Args:
         plan: the jobs.
         cfg: limits.
+        worker: command of a worker, see ``Front``.
     """
 
     tick_s, stays = 0.2, False
 
-    def __init__(self, plan: Plan, cfg: LocalCfg) -> None:
-        shared = room(plan, cfg, len(os.sched_getaffinity(0)), free_memory_gb())
+    def __init__(self, plan: Plan, cfg: LocalCfg, worker: Sequence[str]) -> None:
+        shared = room(plan, cfg, len(os.sched_getaffinity(0)), free_bytes() / 1e9)
         self.slots, self._threads = shared.slots, shared.threads
-        self._folder, self.queue = plan.folder, Queue()
+        self._folder, self._worker, self.queue = plan.folder, worker, Queue()
         self._processes: dict[tuple[str, int], subprocess.Popen[bytes]] = {}
         self._asked: set[tuple[str, int]] = set()
 
     def more(self, working: int) -> int:
-        """Return how many free places there are."""
+        """Return how many places are free."""
         return self.slots - working
 
-    def start(self, tasks: Sequence[Task]) -> None:
+    def start(self, assignments: Sequence[Assignment]) -> None:
         """Start a process for each."""
-        for task in tasks:
-            place = [str(self._folder), task.job.key, str(task.number), str(self._threads)]
-            with open(log_path(self._folder, task.job.name, task.number), "wb") as output:
-                self._processes[task.id] = subprocess.Popen(
-                    [sys.executable, "-m", "pgdm.cli.worker", *place],
+        for assignment in assignments:
+            place = [
+                str(self._folder),
+                assignment.job.key,
+                str(assignment.number),
+                str(self._threads),
+            ]
+            with open(
+                log_path(self._folder, assignment.job.name, assignment.number), "wb"
+            ) as output:
+                self._processes[assignment.id] = subprocess.Popen(
+                    [*self._worker, *place],
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=subprocess.STDOUT,
-                    start_new_session=True,  # Ctrl-C is for us: we ask the workers
+                    start_new_session=True,  # Ctrl-C reaches only the driver, which asks workers
                 )
 
-    def adopt(self, task: Task, attempt: Attempt) -> bool:
-        """Refuse: only who has started a process learns how it ends."""
-        del task, attempt
+    def adopt(self, assignment: Assignment, attempt: Attempt) -> bool:
+        """Refuse: only its parent learns how a process exits."""
+        del assignment, attempt
         return False
 
-    def ended(self, task: Task) -> Ended | None:
-        """Return how a process ended."""
-        code = self._processes[task.id].poll()
+    def ended(self, assignment: Assignment) -> Ended | None:
+        """Return how a process exited."""
+        code = self._processes[assignment.id].poll()
         if code is None:
             return None
-        del self._processes[task.id]
+        del self._processes[assignment.id]
         return Ended(code, f"killed by {signal.Signals(-code).name}" if code < 0 else None)
 
-    def ask(self, tasks: Sequence[Task]) -> None:
+    def ask(self, assignments: Sequence[Assignment]) -> None:
         """Ask processes to stop."""
-        self._ask({task.id for task in tasks})
+        self._ask({assignment.id for assignment in assignments})
 
     def _ask(self, ids: Set[tuple[str, int]]) -> None:
-        """Ask processes once: a second signal would end them without saving."""
-        for task_id in ids - self._asked:
-            self._processes[task_id].send_signal(signal.SIGTERM)
+        """Ask processes once: a second signal would stop them before they have saved."""
+        for work_id in ids - self._asked:
+            self._processes[work_id].send_signal(signal.SIGTERM)
         self._asked |= ids
 
     def end(self, patience_s: float) -> None:
-        """End processes, and what does not end in time with all that it started."""
+        """Stop processes; kill those that do not exit in time, with all their children."""
         if patience_s:
             self._ask(self._processes.keys())
         limit = time.monotonic() + patience_s

@@ -1,4 +1,4 @@
-"""A sweep as MLflow shows it: one run, and its jobs below it. MLflow never stops a sweep."""
+"""A sweep in MLflow: one run with its jobs nested below it. MLflow never stops a sweep."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ from typing import TYPE_CHECKING
 
 from pgdm import paths
 from pgdm.errors import TrackingError
+from pgdm.library.progress import Notify
+from pgdm.runs.files import LINK, read_json
 from pgdm.sweep.ledger import RUNNING
-from pgdm.tracking.run_folder import LINK, read_json
 
 if TYPE_CHECKING:
     from pgdm.sweep.plan import Job, Plan
     from pgdm.tracking.group import Group
 
-Notify = Callable[[str], None]
-
 
 class SweepMirror:
-    """Tells MLflow of a sweep; that it fails there is told once, and the sweep goes on.
+    """Mirrors a sweep to MLflow; reports a failure of MLflow once, and the sweep continues.
 
     Args:
-        group: the sweep's run; None tells nobody.
-        notify: told in a sentence if MLflow fails.
+        group: the sweep's run; None mirrors nothing.
+        notify: called with a sentence if MLflow fails.
     """
 
     def __init__(self, group: Group | None, notify: Notify) -> None:
@@ -33,46 +32,53 @@ class SweepMirror:
 
     @classmethod
     def of(cls, plan: Plan, notify: Notify) -> SweepMirror:
-        """Return the mirror of a plan: where its first job goes that has one."""
+        """Return the mirror of a plan, in the store of its first job that uses MLflow."""
         chosen = next((j.cfg.tracking for j in plan.jobs if j.cfg.tracking.kind == "mlflow"), None)
         if chosen is None:
             return cls(None, notify)
         from pgdm.tracking.group import Group
-        from pgdm.tracking.mlflow import sqlite_file, store_uri
+        from pgdm.tracking.mlflow import is_own, sqlite_file, store_uri
 
-        known = read_json(plan.folder / LINK).get("uri", "")
+        known = str(read_json(plan.folder / LINK).get("uri", ""))
         file = sqlite_file(known)
-        stays = known and (file is None or file.exists())
-        # Among all runs if the sweep lies there, otherwise in its own folder.
+        stays = is_own(known, plan.folder) and file is not None and file.exists()
+        # In the database of all runs if the sweep is among them, otherwise in its own folder.
         runs = paths.runs().absolute()
         here = store_uri(runs if plan.folder.is_relative_to(runs) else plan.folder)
         uri = chosen.uri or (known if stays else here)
         return cls(Group(plan.folder, uri, chosen.experiment), notify)
 
     @classmethod
-    def set_right(cls, folder: Path, dead: Sequence[Path], status: str, notify: Notify) -> None:
-        """Tell MLflow the truth about a sweep that nobody drives.
+    def correct_all(cls, folder: Path, dead: Sequence[Path], status: str, notify: Notify) -> None:
+        """Correct in MLflow the status of a sweep that no process drives, and of its dead runs.
 
         Args:
-            folder: of the sweep.
+            folder: folder of the sweep.
             dead: run folders whose workers were found dead; the sweep may have been closed before.
-            status: how the sweep ended, for MLflow that still holds it to be running.
-            notify: told in a sentence if MLflow fails.
+            status: how the sweep ended, if it is still running according to MLflow.
+            notify: called with a sentence if MLflow fails.
         """
         link = read_json(folder / LINK)
         running = link.get("status") == RUNNING
         if not running and not (dead and "uri" in link):
             return
         from pgdm.tracking.group import Group
+        from pgdm.tracking.mlflow import is_own
 
-        mirror = cls(Group(folder, link["uri"], link["experiment"]), notify)
+        uri = str(link["uri"])
+        if not is_own(uri, folder):
+            notify(
+                f"MLflow at {uri} is left as it is: `pgdm runs sync --uri {uri}` corrects its runs"
+            )
+            return
+        mirror = cls(Group(folder, uri, link["experiment"]), notify)
         for run_dir in dead:
             mirror.correct(run_dir)
         if running:
             mirror.close(status)
 
     def open(self, plan: Plan) -> None:
-        """Make what MLflow needs, before any job starts."""
+        """Create the sweep's run, before any job starts."""
         self._plan = plan
         self._tell(lambda group: group.open(plan.name, {"command": plan.command}))
         for job in plan.jobs:
@@ -80,20 +86,20 @@ class SweepMirror:
                 self.adopt(job)
 
     def adopt(self, job: Job) -> None:
-        """Have a job shown under its sweep, if it goes to MLflow."""
+        """Nest a job below its sweep, if the job uses MLflow."""
         if job.cfg.tracking.kind == "mlflow":
             self._tell(lambda group: group.adopt(Path(job.cfg.run_dir)))
 
     def correct(self, run_dir: Path) -> None:
         """Give a run that was killed its true status."""
-        if self._failed:  # do not wait for it job by job: `pgdm runs sync` does this too
+        if self._failed:  # no waiting for each job: `pgdm runs sync` does this too
             return
         self._tell(lambda group: group.correct(run_dir))
 
     def close(self, status: str) -> None:
-        """Tell how the sweep ended."""
+        """Record how the sweep ended."""
         if self._plan is not None and self._group is not None and not self._group.opened:
-            self.open(self._plan)  # MLflow was out of reach at the start
+            self.open(self._plan)  # MLflow was unreachable at the start
         self._tell(lambda group: group.close(status))
 
     def _tell(self, what: Callable[[Group], None]) -> None:
@@ -104,6 +110,7 @@ class SweepMirror:
         except TrackingError as error:
             if not self._failed:
                 self._notify(
-                    f"{error}; the sweep goes on, `pgdm runs sync` fills in what is missing"
+                    f"{error}; the sweep continues, `pgdm runs sync --uri {self._group.uri}` adds "
+                    "what is missing in MLflow"
                 )
             self._failed = True

@@ -1,40 +1,45 @@
-"""What a sweep is to do: its jobs, each a checked experiment with an identity and a folder."""
+"""The plan of a sweep: its jobs, each a checked experiment with an identity and a folder."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pgdm import files
+from pgdm.config.foreign import check_method
 from pgdm.config.identity import difference, identity, with_added_keys
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.strict import build
-from pgdm.errors import ConfigError, SweepError
-from pgdm.tracking.run_folder import write_json
+from pgdm.errors import ConfigError, SweepError, check_above_zero, check_at_least, check_name
+from pgdm.runs.files import write_json
+from pgdm.sweep.ledger import run_dir_in
+from pgdm.sweep.status import PLAN
 
-FILE = "plan.json"
-"""The plan in the folder of its sweep."""
 FORMAT = 1
 
 
 @dataclass(frozen=True)
 class SweepCfg:
-    """How a sweep is named, kept and driven."""
+    """How a sweep is named, stored and driven."""
 
     name: str | None
-    """Name of the sweep and of its folder; None makes one from the settings."""
+    """Name of the sweep and of its folder; None derives it from the settings."""
     dir: str | None
     """Folder of the sweep; None is ``runs/sweeps/<name>``."""
     max_attempts: int
     """How often a job is tried, each time the sweep is started, before it counts as failed."""
     detach: bool
-    """Go on in the background, and return at once."""
+    """Run in the background, and return immediately."""
     dry_run: bool
     """Print the plan, and start nothing."""
+    most_jobs: int
+    """How many jobs a sweep may have."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +49,11 @@ class LocalCfg:
     name: str
     """Which launcher this is: ``local``."""
     max_jobs: int
-    """Most jobs at a time; 0 is as many as cores and memory allow."""
+    """Most jobs at a time; 0: as many as cores and memory allow."""
     cores_per_job: int
-    """Threads of each job; 0 divides the cores by the jobs."""
+    """Threads of each job; 0: the cores divided by the jobs."""
     memory_per_job_gb: float
-    """Memory to reckon with for each job [GB]."""
+    """Memory to allow for each job [GB]."""
 
 
 @dataclass(frozen=True)
@@ -58,15 +63,15 @@ class SlurmCfg:
     name: str
     """Which launcher this is: ``slurm``."""
     partition: str | None
-    """None is the cluster's default."""
+    """Partition; None: the cluster's default."""
     account: str | None
-    """Account to charge; None is the user's default."""
+    """Account to charge; None: the user's default."""
     qos: str | None
-    """Quality of service; None is the default."""
+    """Quality of service; None: the default."""
     constraint: str | None
-    """Features that nodes must have; None takes any node."""
+    """Features that nodes must have; None: any node."""
     time_min: int
-    """Time limit; at the limit a job saves, and goes on under the next one [min]."""
+    """Time limit; a job that reaches it saves, and resumes in Slurm's queue [min]."""
     cores_per_job: int
     """Cores, and threads, of each job."""
     memory_per_job_gb: float
@@ -76,11 +81,11 @@ class SlurmCfg:
     gres: str | None
     """Other generic resources of each job, such as ``shard:1``."""
     array_parallelism: int
-    """Most jobs at a time; 0 is as many as Slurm lets run."""
+    """Most jobs at a time; 0: as many as Slurm lets run."""
     signal_delay_s: int
-    """How long before the time limit a job is told to save [s]."""
+    """How long before the time limit a job is asked to save [s]."""
     poll_s: float
-    """Time between two questions to Slurm, one for all jobs [s]."""
+    """Time between two queries to Slurm, each for all jobs [s]."""
     setup: list[str]
     """Shell commands before each job."""
     additional_parameters: list[str]
@@ -90,17 +95,46 @@ class SlurmCfg:
 LauncherCfg = LocalCfg | SlurmCfg
 LAUNCHERS = {"local": LocalCfg, "slurm": SlurmCfg}
 
+_LEAST_LOCAL = {"max_jobs": 0, "cores_per_job": 0}
+_LEAST_SLURM = {
+    **{"time_min": 1, "cores_per_job": 1, "signal_delay_s": 1, "poll_s": 1},
+    **{"gpus_per_job": 0, "array_parallelism": 0},
+}
+
+
+def read_launcher(choice: str, settings: object) -> LauncherCfg:
+    """Return the checked settings of a launcher.
+
+    Args:
+        choice: its option in ``hydra/launcher``.
+        settings: composed settings.
+
+    Raises:
+        ConfigError: if there is no such launcher, or a setting is wrong.
+    """
+    check_name("hydra/launcher of pgdm", choice, LAUNCHERS)
+    cfg: LauncherCfg = build(LAUNCHERS[choice], settings, "hydra.launcher")
+    for key, bound in (_LEAST_LOCAL if isinstance(cfg, LocalCfg) else _LEAST_SLURM).items():
+        check_at_least(f"hydra.launcher.{key}", getattr(cfg, key), bound)
+    check_above_zero("hydra.launcher.memory_per_job_gb", cfg.memory_per_job_gb)
+    if not isinstance(cfg, LocalCfg) and cfg.signal_delay_s >= 60 * cfg.time_min:
+        raise ConfigError(
+            f"hydra.launcher.signal_delay_s is {cfg.signal_delay_s}, and the time limit "
+            f"time_min only {cfg.time_min} minutes; choose a longer one"
+        )
+    return cfg
+
 
 @dataclass(frozen=True)
 class Job:
     """One experiment of a sweep."""
 
     key: str
-    """16 hex digits that follow from everything that changes the result."""
+    """16 hex digits, a hash of every setting that changes the result."""
     name: str
-    """What tells it from the others, such as ``task=cup-pour1 seed=1``."""
+    """What distinguishes it from the others, such as ``task=cup-pour1 seed=1``."""
     overrides: tuple[str, ...]
-    """All of its overrides, enough to make it again."""
+    """All of its overrides, enough to compose it again."""
     cfg: ExperimentCfg
     """The experiment; ``cfg.run_dir`` is its own folder, absolute."""
 
@@ -114,20 +148,20 @@ class Plan:
     folder: Path
     """Folder of the sweep, absolute: ``plan.json``, ``ledger.sqlite``, ``logs/``, and its runs."""
     jobs: tuple[Job, ...]
-    """What is to be done; no two have the same key."""
+    """No two have the same key."""
     command: str
     """What was typed."""
 
 
 def job_key(cfg: ExperimentCfg) -> str:
-    """Return 16 hex digits that two experiments share if they come to the same result."""
-    # The length belongs to a result, though a longer run may go on in a shorter one's folder.
+    """Return 16 hex digits, equal for two experiments that have the same result."""
+    # The length belongs to a result, though a longer run may resume a shorter one's folder.
     whole = identity(cfg) | {"total_frames": cfg.total_frames}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def record(plan: Plan) -> None:
-    """Write ``plan.json`` with the jobs of a plan beside those that it has already.
+    """Write ``plan.json`` with the jobs of a plan added to those that it has already.
 
     Raises:
         SweepError: as ``check_fits``.
@@ -137,12 +171,12 @@ def record(plan: Plan) -> None:
 
 
 def check_fits(plan: Plan) -> tuple[Job, ...]:
-    """Return the jobs that the folder of a plan has already; none of them may have changed.
+    """Return the jobs that the folder of a plan holds already; none of them may have changed.
 
     Raises:
         SweepError: if a job of the same name had other settings; the message is the difference.
     """
-    if not (plan.folder / FILE).exists():
+    if not (plan.folder / PLAN).exists():
         return ()
     known = read_plan(plan.folder).jobs
     before = {job.name: job for job in known}
@@ -152,33 +186,27 @@ def check_fits(plan: Plan) -> tuple[Job, ...]:
         whole = [("total_frames", old.cfg.total_frames, new.cfg.total_frames)]
         changes = difference(old.cfg, new.cfg) + [f"{k}: {a} -> {b}" for k, a, b in whole if a != b]
         raise SweepError(
-            f"sweep '{plan.name}' in '{plan.folder}' was made with other settings ({new.name}: "
-            f"{'; '.join(changes)}{f'; {others} more differ too' if others else ''}); choose "
-            "another sweep.name, or the settings it was made with"
+            f"sweep '{plan.name}' in '{plan.folder}' was planned with other settings ({new.name}: "
+            f"{'; '.join(changes)}{f'; {others} more jobs differ too' if others else ''}); choose "
+            "another sweep.name, or the settings it was planned with"
         )
     return known
 
 
 def write_plan(plan: Plan) -> None:
-    """Write ``plan.json`` into the folder of the sweep, whole or not at all."""
+    """Write ``plan.json`` into the folder of the sweep, atomically."""
     jobs = [
         {
             "key": job.key,
             "name": job.name,
             "overrides": list(job.overrides),
-            "config": dataclasses.asdict(job.cfg) | {"run_dir": _shown(job.cfg.run_dir, plan)},
+            "config": dataclasses.asdict(job.cfg) | {"run_dir": run_dir_in(plan.folder, job)},
         }
         for job in plan.jobs
     ]
     whole = {"format": FORMAT, "name": plan.name, "command": plan.command, "jobs": jobs}
     plan.folder.mkdir(parents=True, exist_ok=True)
-    write_json(plan.folder / FILE, whole)
-
-
-def _shown(run_dir: str, plan: Plan) -> str:
-    """Return a run's folder as the file names it, so that a sweep may be moved as a whole."""
-    path = Path(run_dir)
-    return str(path.relative_to(plan.folder) if path.is_relative_to(plan.folder) else path)
+    write_json(plan.folder / PLAN, whole)
 
 
 def read_plan(folder: Path) -> Plan:
@@ -188,26 +216,48 @@ def read_plan(folder: Path) -> Plan:
         SweepError: if the folder holds no sweep, or its plan is damaged or of another version.
     """
     folder = folder.absolute()
-    file = folder / FILE
+    with _opened(folder) as whole:
+        jobs = tuple(_job(entry, folder) for entry in whole["jobs"])
+        return Plan(whole["name"], folder, jobs, whole["command"])
+
+
+def read_job(folder: Path, key: str) -> Job:
+    """Read one job of a sweep's plan by its key.
+
+    Raises:
+        SweepError: as ``read_plan``, or if the plan has no such job.
+    """
+    folder = folder.absolute()
+    with _opened(folder) as whole:
+        for entry in whole["jobs"]:
+            if entry["key"] == key:
+                return _job(entry, folder)
+    raise SweepError(f"the plan of {folder} has no job {key}; run the sweep's command again")
+
+
+@contextmanager
+def _opened(folder: Path) -> Iterator[dict[str, Any]]:
+    """Give the content of ``plan.json``, and explain what is wrong with it."""
+    file = folder / PLAN
     try:
-        whole = json.loads(file.read_text(encoding="utf-8"))
-        known = whole["format"] == FORMAT
-        jobs = tuple(_job(entry, folder) for entry in whole["jobs"]) if known else ()
-        plan = Plan(whole["name"], folder, jobs, whole["command"])
+        whole = files.read_json(file)
+        if whole["format"] != FORMAT:
+            raise SweepError(f"{file} has the format of another pgdm; choose another sweep.name")
+        yield whole
     except FileNotFoundError as error:
-        raise SweepError(f"'{folder}' holds no sweep: it has no {FILE}") from error
+        raise SweepError(f"'{folder}' holds no sweep: it has no {PLAN}") from error
+    except OSError as error:
+        raise SweepError(f"cannot read {file}: {files.reason(error)}") from error
     except ConfigError as error:
         raise SweepError(
-            f"{file} was made by a pgdm with other settings ({error}); choose another sweep.name"
+            f"{file} was written by a pgdm with other settings ({error}); choose another sweep.name"
         ) from error
     except (ValueError, LookupError, TypeError) as error:
         raise SweepError(f"{file} is damaged ({error}); remove it to plan anew") from error
-    if not known:
-        raise SweepError(f"{file} has a format of another pgdm; choose another sweep.name")
-    return plan
 
 
 def _job(entry: Mapping[str, Any], folder: Path) -> Job:
     config = with_added_keys(entry["config"])
+    check_method(config, str(folder / PLAN))
     cfg = build(ExperimentCfg, config | {"run_dir": str(folder / config["run_dir"])})
     return Job(entry["key"], entry["name"], tuple(entry["overrides"]), cfg)

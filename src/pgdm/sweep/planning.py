@@ -1,63 +1,66 @@
-"""From composed settings to a plan: everything is checked here, before anything starts."""
+"""From composed settings to a plan; every job is checked before any starts."""
 
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-
-from omegaconf import DictConfig, OmegaConf
+from typing import Any
 
 from pgdm import paths
-from pgdm.config.identity import default_run_dir
+from pgdm.config.compose import checked
 from pgdm.config.schema import ExperimentCfg
-from pgdm.config.store import from_dict_config
-from pgdm.errors import ConfigError
+from pgdm.errors import ConfigError, check_at_least
+from pgdm.library.progress import StepProgress, silent
+from pgdm.sweep.expand import Composed
 from pgdm.sweep.plan import Job, Plan, SweepCfg, job_key
 from pgdm.sweep.studies import NOT_IN_A_NAME
-
-Composed = tuple[tuple[str, ...], DictConfig]
-"""Overrides of a job, and the settings that they lead to."""
+from pgdm.tracking import located
 
 
 def make_plan(
-    composed: Sequence[Composed], sweep: SweepCfg, name: str, command: str
+    composed: Sequence[Composed],
+    sweep: SweepCfg,
+    name: str,
+    command: str,
+    progress: StepProgress = silent,
 ) -> tuple[Plan, list[str]]:
-    """Check the settings of every job, and return the plan and what people should know of it.
+    """Check the settings of every job, and return the plan and notes for the user.
 
     Args:
         composed: the jobs.
         sweep: settings of the sweep.
         name: its name if ``sweep.name`` has none.
         command: what was typed.
+        progress: called with the number of jobs checked so far.
 
     Raises:
-        ConfigError: if the settings of a job are wrong, or jobs would get into each other's way.
+        ConfigError: if the settings of a job are wrong, or jobs would share a run folder.
     """
     name = name if sweep.name is None else sweep.name
-    if not re.fullmatch(r"\w[\w.+-]*", name):
-        raise ConfigError(f"sweep.name '{name}' is no name for a folder; use letters, digits, _.+-")
-    if sweep.max_attempts < 1:
-        raise ConfigError(f"sweep.max_attempts is {sweep.max_attempts}; it must be at least 1")
+    paths.check_path_part("sweep.name", name)
+    check_at_least("sweep.max_attempts", sweep.max_attempts, 1)
     folder = (paths.runs() / "sweeps" / name if sweep.dir is None else Path(sweep.dir)).absolute()
     jobs: dict[str, Job] = {}
-    notes = []
+    notes: list[str] = []
+    stores: list[str] = []  # a sentence for each job
     for (overrides, settings), job_name in zip(composed, _names(composed), strict=True):
-        cfg = _placed(_checked(settings, job_name), folder)
+        cfg = _placed(_checked(settings, job_name), settings.get("run_dir"), folder)
+        cfg = dataclasses.replace(cfg, tracking=located(cfg.tracking, stores.append))
         job = Job(job_key(cfg), job_name, overrides, cfg)
+        progress("checking the runs", len(jobs) + len(notes), len(composed))
         if job.key in jobs:
             same = " ".join(jobs[job.key].overrides)
-            notes.append(f"'{' '.join(overrides)}' would repeat '{same}', and is left out")
+            notes.append(f"'{' '.join(overrides)}' repeats '{same}', and is left out")
         else:
             jobs[job.key] = job
     _check_folders(list(jobs.values()))
-    return Plan(name, folder, tuple(jobs.values()), command), notes
+    return Plan(name, folder, tuple(jobs.values()), command), [*dict.fromkeys(stores), *notes]
 
 
 def _names(composed: Sequence[Composed]) -> list[str]:
-    """Return what tells each job from the others, also from those of other commands."""
+    """Return what distinguishes each job from the others, also from those of other commands."""
     given = [
         {key.lstrip("+"): value for key, _, value in (o.partition("=") for o in overrides)}
         for overrides, _ in composed
@@ -67,30 +70,30 @@ def _names(composed: Sequence[Composed]) -> list[str]:
     others = [key for key in varied if key.partition(".")[0] not in NOT_IN_A_NAME]
     names = []
     for one, (_, settings) in zip(given, composed, strict=True):
-        # Not yet checked: there may be neither.
+        # Not checked yet: both may be missing.
+        task = settings.get("task")
         ends = {
-            "task": OmegaConf.select(settings, "task.id"),
-            "seed": OmegaConf.select(settings, "seed"),
+            "task": task.get("id") if isinstance(task, dict) else None,
+            "seed": settings.get("seed"),
         } | one
         keys = ["task", *(key for key in others if key in one), "seed"]
         names.append(" ".join(f"{key}={ends[key]}" for key in keys))
     return names
 
 
-def _checked(settings: DictConfig, name: str) -> ExperimentCfg:
+def _checked(settings: Mapping[str, Any], name: str) -> ExperimentCfg:
     try:
-        return from_dict_config(settings)
+        return checked(settings)
     except ConfigError as error:
         raise ConfigError(f"{error} (in the run {name}; none was started)") from error
 
 
-def _placed(cfg: ExperimentCfg, folder: Path) -> ExperimentCfg:
-    """Give a run its place in the folder of the sweep, unless it was given one."""
-    default = default_run_dir(cfg)
-    if cfg.run_dir == default:
-        inner = Path(default).relative_to("runs")
+def _placed(cfg: ExperimentCfg, run_dir: str | None, folder: Path) -> ExperimentCfg:
+    """Place a run in the folder of the sweep, unless it has a folder of its own."""
+    if run_dir is None:
+        inner = Path(cfg.run_dir).relative_to("runs")  # the default
         return dataclasses.replace(cfg, run_dir=str(folder / "runs" / "-".join(inner.parts)))
-    return dataclasses.replace(cfg, run_dir=str(Path(cfg.run_dir).absolute()))
+    return dataclasses.replace(cfg, run_dir=str(Path(run_dir).absolute()))
 
 
 def _check_folders(jobs: Sequence[Job]) -> None:

@@ -1,4 +1,4 @@
-"""What Slurm says of its jobs; every question is asked for all of them at once."""
+"""The states of jobs in Slurm; one query covers all of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pgdm.errors import SweepError
 
 GONE, UNKNOWN = "GONE", "UNKNOWN"
-"""Not Slurm's words: it has no such job (any more), or cannot be asked."""
+"""States of our own: Slurm has no such job (any more), or cannot be queried."""
 _PENDING = ("PENDING", "REQUEUED", "REQUEUE_FED", "REQUEUE_HOLD", "RESV_DEL_HOLD", "SPECIAL_EXIT")
 _ENDED = (
     *("BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY"),
@@ -22,7 +22,7 @@ _STUCK = (
     *("invalidqos", "jobholdmaxrequeue", "launch failed", "partitionnodelimit"),
     *("partitiontimelimit", "qosnotallowed"),
 )
-_QUESTION = ("squeue", "--me", "--array", "--states=all", "--noheader")
+_QUERY = ("squeue", "--me", "--array", "--states=all", "--noheader")
 _FIELDS = "--Format=JobArrayID:40,State:20,exit_code:12,Reason:80"
 _ANSWER_S = 60.0
 _AGAIN_S = 1.0
@@ -30,38 +30,38 @@ _AGAIN_S = 1.0
 
 @dataclass(frozen=True)
 class Standing:
-    """Where one of Slurm's jobs stands."""
+    """The state of one of Slurm's jobs."""
 
     state: str
-    """Slurm's word, such as ``RUNNING``; or ``GONE``, ``UNKNOWN``."""
+    """Slurm's name of it, such as ``RUNNING``; or ``GONE``, ``UNKNOWN``."""
     status: int = 0
-    """How its process ended, as ``wait`` tells it."""
+    """Exit status of its process, as ``wait`` returns it."""
     reason: str = ""
-    """Why it waits, or ended."""
+    """Why it waits, or has ended."""
 
     @property
     def alive(self) -> bool:
-        """Whether it runs or will run; so is what cannot be asked."""
+        """Whether it runs or will run; assumed if Slurm cannot be queried."""
         return self.state not in _ENDED
 
     @property
     def pending(self) -> bool:
-        """Whether it waits for its start, the first or another one."""
+        """Whether it waits to be started, for the first time or again."""
         return self.state in _PENDING
 
     @property
     def stuck(self) -> bool:
-        """Whether Slurm will never start it, as it is."""
+        """Whether Slurm will never start it."""
         return self.pending and self.reason.lower().replace("_", " ").startswith(_STUCK)
 
     @property
     def exit_code(self) -> int:
-        """Exit code, or minus the signal that ended it."""
+        """Exit code, or minus the signal that killed it."""
         return self.status >> 8 or -(self.status & 0x7F)
 
 
 class Queue:
-    """The user's jobs in Slurm, as they were a moment ago.
+    """The user's jobs in Slurm, cached for a short time.
 
     Args:
         interval_s: how old an answer may be, s.
@@ -74,9 +74,9 @@ class Queue:
         self._answered_s = time.monotonic()
 
     def find(self, slurm_id: str) -> Standing:
-        """Return where a job stands."""
+        """Return the state of a job."""
         age_s = time.monotonic() - self._asked_s
-        # What is missing may be newer than the answer.
+        # A missing job may be newer than the answer.
         missing = self._found is not None and slurm_id not in self._found
         if age_s > self._interval_s or (missing and age_s > _AGAIN_S):
             self._ask()
@@ -85,17 +85,17 @@ class Queue:
         return self._found.get(slurm_id, Standing(GONE))
 
     def forget(self) -> None:
-        """Ask anew when next asked: something has changed."""
+        """Query Slurm at the next call: something has changed."""
         self._asked_s = -math.inf
 
     @property
     def silent_s(self) -> float:
-        """For how long Slurm has not answered, s."""
+        """Time since Slurm stopped answering, s."""
         return 0.0 if self._found is not None else time.monotonic() - self._answered_s
 
     def _ask(self) -> None:
         try:
-            self._found = parse(told([*_QUESTION, _FIELDS]))
+            self._found = parse(output([*_QUERY, _FIELDS]))
             self._answered_s = time.monotonic()
         except SweepError:
             self._found = None
@@ -112,27 +112,27 @@ def parse(text: str) -> dict[str, Standing]:
 
 
 def cancel(slurm_ids: Iterable[str]) -> None:
-    """Have Slurm end jobs: a signal to save, then, after its ``KillWait``, the end."""
+    """Have Slurm cancel jobs: it signals them to save, and kills them after its ``KillWait``."""
     try:
         if ids := list(slurm_ids):
-            told(["scancel", "--quiet", *ids])
+            output(["scancel", "--quiet", *ids])
     except SweepError as error:
-        if "Invalid job id" not in str(error):  # what has ended long ago
+        if "Invalid job id" not in str(error):  # it has ended long ago
             raise
 
 
 def requeue(slurm_id: str) -> None:
-    """Have Slurm start this job once more, unless it is ending it for good.
+    """Have Slurm queue this job again, unless it is being cancelled.
 
-    Asked from inside the job, which has saved because its time is up or its node is wanted.
+    Called inside the job, which has saved because its time is up or it is preempted.
     """
-    state = told(["squeue", "--noheader", "--jobs", slurm_id, "--format=%T"]).strip()
+    state = output(["squeue", "--noheader", "--jobs", slurm_id, "--format=%T"]).strip()
     if state in ("RUNNING", "SIGNALING"):
-        told(["scontrol", "requeue", slurm_id])
+        output(["scontrol", "requeue", slurm_id])
 
 
-def told(command: list[str]) -> str:
-    """Run one of Slurm's commands, and return what it prints.
+def output(command: list[str]) -> str:
+    """Run one of Slurm's commands, and return its output.
 
     Raises:
         SweepError: if it is missing, fails or does not answer.

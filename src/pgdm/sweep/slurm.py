@@ -1,13 +1,12 @@
 """Workers as jobs of a Slurm cluster: one array for all that are started together.
 
-An attempt is one of Slurm's jobs. A worker that has to make room (its time is up, its node is
-wanted) saves and has Slurm queue the same job again; what Slurm itself queues again, after a node
-failed, goes on in the same way. So the attempt goes on as well, and needs no driver for it.
+An attempt is one of Slurm's jobs. A worker that is preempted or runs out of time saves and has
+Slurm queue the same job again; after a node failure Slurm does so itself. Either way the attempt
+continues, and needs no driver.
 """
 
 from __future__ import annotations
 
-import importlib
 import os
 import shutil
 import signal
@@ -17,22 +16,23 @@ from typing import Any
 
 from pgdm.errors import SweepError
 from pgdm.stop import STOPPED
-from pgdm.sweep.launcher import Ended, Task
+from pgdm.sweep.launcher import Assignment, Ended
 from pgdm.sweep.ledger import Attempt, Ledger
 from pgdm.sweep.plan import Plan, SlurmCfg
 from pgdm.sweep.queue import GONE, Queue, cancel
-from pgdm.sweep.state import LOGS, log_path
+from pgdm.sweep.status import LOGS, log_path
 
 _OUTPUT = "slurm"
-"""Folder among the logs with what submitit needs, and what Slurm's jobs print."""
+"""Folder among the logs with submitit's files and the output of Slurm's jobs."""
+_PASSED_ON = ("partition", "account", "qos", "constraint", "gres", "signal_delay_s")
 _DISPLACED = ("PREEMPTED", "TIMEOUT")
-_ITSELF = ("COMPLETED", "FAILED")
+_EXITED = ("COMPLETED", "FAILED")
 _SILENT_S = 3600.0
-"""How long Slurm may not answer before the driver gives up."""
+"""How long Slurm may be unreachable before the driver gives up."""
 
 
 def check_slurm() -> None:
-    """Check that there is a Slurm to talk to.
+    """Check that Slurm is installed here.
 
     Raises:
         SweepError: if not.
@@ -50,57 +50,54 @@ def parameters(cfg: SlurmCfg, name: str, at_once: int) -> dict[str, Any]:
 
     Args:
         cfg: what each job gets.
-        name: of the array in Slurm.
+        name: name of the array in Slurm.
         at_once: how many of it may run at a time.
     """
     more = [option.partition("=") for option in cfg.additional_parameters]
     return {
         "job_name": name,
-        "partition": cfg.partition,
-        "account": cfg.account,
-        "qos": cfg.qos,
-        "constraint": cfg.constraint,
+        **{key: getattr(cfg, key) for key in _PASSED_ON},
         "time": cfg.time_min,
         "cpus_per_task": cfg.cores_per_job,
         "mem": f"{round(cfg.memory_per_job_gb * 1024)}MB",
         "gpus_per_node": cfg.gpus_per_job or None,
-        "gres": cfg.gres,
         "array_parallelism": at_once,
-        "signal_delay_s": cfg.signal_delay_s,
         "setup": cfg.setup or None,
         "stderr_to_stdout": True,
         "wckey": None,
-        # Since Slurm 22.05 srun no longer takes this over from sbatch, and would give one core.
+        # Since Slurm 22.05 srun does not inherit this from sbatch, and would give one core.
         "srun_args": [f"--cpus-per-task={cfg.cores_per_job}"],
         "additional_parameters": {"requeue": True} | {k: v or True for k, _, v in more},
     }
 
 
 class SlurmLauncher:
-    """Starts workers as Slurm's jobs; as ``Launcher`` says.
+    """Starts workers as Slurm's jobs; see ``Launcher``.
 
     Args:
         plan: the jobs.
         cfg: what each gets.
+        worker: command of a worker, see ``Front``.
     """
 
     tick_s, stays = 1.0, True
 
-    def __init__(self, plan: Plan, cfg: SlurmCfg) -> None:
-        self._plan, self._cfg, self._ledger = plan, cfg, Ledger(plan.folder)
+    def __init__(self, plan: Plan, cfg: SlurmCfg, worker: Sequence[str]) -> None:
+        self._plan, self._cfg, self._worker = plan, cfg, worker
+        self._ledger = Ledger(plan.folder)
         self.slots = cfg.array_parallelism or len(plan.jobs)
         self.queue = Queue(cfg.poll_s)
         self._slurm_ids: dict[tuple[str, int], str] = {}
 
     def more(self, working: int) -> int:
-        """Return how many jobs may be handed over: all, or none while Slurm has enough.
+        """Return how many jobs may be submitted: all, or none while Slurm has enough.
 
-        Slurm holds the bound within an array; beside others, the driver has to.
+        Slurm enforces the limit within one array, the driver across arrays.
         """
         return len(self._plan.jobs) if working < self.slots else 0
 
-    def start(self, tasks: Sequence[Task]) -> None:
-        """Hand one array over to Slurm."""
+    def start(self, assignments: Sequence[Assignment]) -> None:
+        """Submit one array."""
         from submitit import SlurmExecutor
         from submitit.core.utils import FailedJobError, FailedSubmissionError
 
@@ -109,79 +106,77 @@ class SlurmLauncher:
         at_once = self.slots - len(self._slurm_ids)
         executor.update_parameters(**parameters(self._cfg, self._plan.name, at_once))
         folder, threads = str(self._plan.folder), str(self._cfg.cores_per_job)
-        places = [(folder, t.job.key, str(t.number), threads) for t in tasks]
+        commands = [(*self._worker, folder, t.job.key, str(t.number), threads) for t in assignments]
         try:
-            jobs = executor.map_array(_work, places)
+            jobs = executor.map_array(_become, commands)
         except (FailedJobError, FailedSubmissionError) as error:
             raise SweepError(f"Slurm refused the jobs: {_reason(str(error))}") from error
-        new = {task.id: job.job_id for task, job in zip(tasks, jobs, strict=True)}
+        new = {assignment.id: job.job_id for assignment, job in zip(assignments, jobs, strict=True)}
         self._ledger.submitted(new)
         self._slurm_ids |= new
-        for task, job in zip(tasks, jobs, strict=True):
-            log = log_path(self._plan.folder, task.job.name, task.number)
+        for assignment, job in zip(assignments, jobs, strict=True):
+            log = log_path(self._plan.folder, assignment.job.name, assignment.number)
             log.unlink(missing_ok=True)
             log.symlink_to(os.path.relpath(job.paths.stdout, log.parent))
         self.queue.forget()
 
-    def adopt(self, task: Task, attempt: Attempt) -> bool:
-        """Look after a job that is in Slurm already."""
+    def adopt(self, assignment: Assignment, attempt: Attempt) -> bool:
+        """Follow a job that is in Slurm already."""
         if attempt.slurm_id is None:
             return False
-        self._slurm_ids[task.id] = attempt.slurm_id
+        self._slurm_ids[assignment.id] = attempt.slurm_id
         return True
 
-    def ended(self, task: Task) -> Ended | None:
-        """Return how one of Slurm's jobs ended.
+    def ended(self, assignment: Assignment) -> Ended | None:
+        """Return how one of Slurm's jobs exited.
 
         Raises:
-            SweepError: if Slurm has not answered for long.
+            SweepError: if Slurm has been unreachable for an hour.
         """
-        slurm_id = self._slurm_ids[task.id]
+        slurm_id = self._slurm_ids[assignment.id]
         found = self.queue.find(slurm_id)
         if self.queue.silent_s > _SILENT_S:
             raise SweepError(
-                f"squeue has failed for {_SILENT_S / 60:.0f} minutes; start the same command again "
-                "when Slurm is back: the jobs do not need this process"
+                f"squeue has failed for {_SILENT_S / 60:.0f} minutes; run the same command again "
+                "when Slurm is back (the jobs do not need this process)"
             )
         if found.alive and not found.stuck:
             return None
-        del self._slurm_ids[task.id]
+        del self._slurm_ids[assignment.id]
         if found.stuck:
             cancel([slurm_id])
-            return Ended(None, f"Slurm would never start its job {slurm_id}: {found.reason}")
-        if found.state in _ITSELF:
+            return Ended(None, f"Slurm will never start its job {slurm_id}: {found.reason}")
+        if found.state in _EXITED:
             return Ended(found.exit_code, displaced=found.exit_code in STOPPED)
         if found.state == GONE:
-            return Ended(None, f"Slurm knows nothing of its job {slurm_id}")
+            return Ended(None, f"Slurm has no job {slurm_id} any more")
         why = f" ({found.reason})" if found.reason not in ("", "None") else ""
         error = f"ended by Slurm: job {slurm_id} is {found.state}{why}"
         return Ended(None, error, found.state in _DISPLACED)
 
-    def ask(self, tasks: Sequence[Task]) -> None:
-        """Have Slurm end jobs; those that run save."""
-        cancel(self._slurm_ids[task.id] for task in tasks)
+    def ask(self, assignments: Sequence[Assignment]) -> None:
+        """Have Slurm cancel jobs; running ones save."""
+        cancel(self._slurm_ids[assignment.id] for assignment in assignments)
 
     def end(self, patience_s: float) -> None:
-        """End nothing: Slurm's jobs go on by themselves."""
+        """Stop nothing: Slurm's jobs continue without a driver."""
         del patience_s
 
 
 def _reason(text: str) -> str:
-    """Return what sbatch complains of."""
+    """Return sbatch's error messages."""
     lines = [line for line in text.splitlines() if line.startswith("sbatch: error: ")]
     return " ".join(line.removeprefix("sbatch: error: ") for line in lines) or text
 
 
-def _work(place: tuple[str, ...]) -> None:
-    """Be a worker; runs as one of Slurm's jobs."""
+def _become(command: tuple[str, ...]) -> None:
+    """Replace this process, one of Slurm's jobs, by a worker, whose exit code Slurm then sees."""
     from submitit import JobEnvironment
 
     # Until the run listens there is nothing to save. submitit would queue the job again without
-    # saving, and logs signals wherever the program is, even half way through an import.
+    # saving, and logs signals wherever the program is, even in the middle of an import.
     for number in (signal.SIGUSR2, signal.SIGTERM, signal.SIGCONT):
-        signal.signal(number, signal.SIG_IGN)
-    # By its name, as on this machine: it lies above.
-    worker = importlib.import_module("pgdm.cli.worker")
-    # Slurm is told the truth: submitit would take any return for success.
-    if code := worker.main([*place, JobEnvironment().job_id]):
-        sys.exit(code)
+        signal.signal(number, signal.SIG_IGN)  # inherited by the worker
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(command[0], [*command, JobEnvironment().job_id])

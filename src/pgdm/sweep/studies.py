@@ -1,4 +1,4 @@
-"""Sweeps as files: what one would type after ``pgdm-run -m``, written down."""
+"""Studies: sweeps stored as files, with what one would type after ``pgdm-run -m``."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import yaml
-
+from pgdm import files, paths
+from pgdm.config.foreign import check_settings
 from pgdm.config.groups import conf_dir, folders
 from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.paths import as_name
 
 _KEY = "+sweep"
 
-# What of a command says which jobs, where, how fast or how often, and not which study it is.
+# Settings of which jobs run, where, how fast or how often; they do not distinguish studies.
 NOT_IN_A_NAME = (
     "task", "seed", "sweep", "hydra", "run_dir", "resume", "offline", "num_threads", "device",
     "tracking", "checkpoint",
@@ -22,8 +23,8 @@ NOT_IN_A_NAME = (
 
 
 def studies(config_dir: str | Path | None = None) -> dict[str, Path]:
-    """Return the names of the sweep files, each with its file; a name of pgdm's stays pgdm's."""
-    # In a checkout they lie beside conf/, in an installed package as well.
+    """Return the sweep files by name; for a name that pgdm and the user have, pgdm's file."""
+    # Next to conf/, in a checkout as in an installed package.
     places = [conf_dir().parent, *folders(config_dir)[1:]]
     own_last = [file for folder in places for file in (folder / "sweeps").glob("*.yaml")]
     return dict(sorted((file.stem, file) for file in reversed(own_last)))
@@ -35,8 +36,8 @@ def open_study(
     """Read the sweep file that ``+sweep=NAME`` names.
 
     Returns:
-        The name of the sweep file, None if there is none; what else was typed; and what the file
-        says, which is to stand before that.
+        The name of the sweep file, None if there is none; the other overrides; and the overrides
+        in the file, which come before those.
 
     Raises:
         UnknownNameError: if there is no such sweep file.
@@ -51,19 +52,19 @@ def open_study(
     if not named:
         return None, typed, []
     if len(named) > 1:
-        raise ConfigError(f"{_KEY} is there {len(named)} times; start one sweep at a time")
+        raise ConfigError(f"{_KEY} is given {len(named)} times; start one sweep at a time")
     file = _find(named[0], config_dir)
     return file.stem, typed, _read(file)
 
 
 def default_name(overrides: Sequence[str], study: str | None) -> str:
-    """Return the name of a sweep that was given none.
+    """Return the name of a sweep without ``sweep.name``.
 
-    It follows from the sweep file and the overrides, but neither from tasks nor from seeds: more
-    of these belong to the same sweep.
+    It depends on the sweep file and the overrides, but neither on tasks nor on seeds: a command
+    with more of these extends the same sweep.
 
     Args:
-        overrides: as typed.
+        overrides: overrides as typed.
         study: name of the sweep file.
     """
     given = {o.partition("=")[0]: o.partition("=")[2] for o in overrides}
@@ -79,14 +80,14 @@ def default_name(overrides: Sequence[str], study: str | None) -> str:
         text = "-".join(rest.values())[:40]
         digest = hashlib.sha256(repr(sorted(rest.items())).encode()).hexdigest()[:6]
         parts += [text, digest]
-    return re.sub(r"[^\w.+-]+", "-", "-".join(parts))
+    return as_name("-".join(parts))
 
 
 def _find(name: str, config_dir: str | Path | None) -> Path:
     known = studies(config_dir)
     if name in known:
         return known[name]
-    file = Path(name).expanduser()
+    file = paths.expanded(name) if name.startswith("~") else Path(name)
     if file.suffix in (".yaml", ".yml") and file.is_file():
         return file
     raise UnknownNameError("sweep file", name, known)
@@ -94,16 +95,17 @@ def _find(name: str, config_dir: str | Path | None) -> Path:
 
 def _read(file: Path) -> list[str]:
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from error
+        content = files.read_yaml(file)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{file}: {files.reason(error)}") from error
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        raise ConfigError(f"{file} holds no sweep; write lines such as task: tcdm30")
+        raise ConfigError(f"{file} is no sweep file; write lines such as task: tcdm30")
+    check_settings(content, str(file))
     return [f"{key}={_value(value, file)}" for key, value in content.items()]
 
 
 def _value(value: object, file: Path) -> str:
-    """Return a value as one would type it; a list is of values to try."""
+    """Return a value as one would type it; a list holds the values to try."""
     if isinstance(value, dict):
         raise ConfigError(f"{file}: write nested keys in one line, such as algo.clip: 0.1")
     if isinstance(value, list):

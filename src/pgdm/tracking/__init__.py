@@ -1,24 +1,31 @@
-"""Record runs: in their own folder, which is the truth, and in MLflow, which mirrors it."""
+"""MLflow, which mirrors run folders."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pgdm.errors import UnknownNameError
-from pgdm.tracking.run_folder import RunFolder
-from pgdm.tracking.run_log import RunLog
-from pgdm.tracking.tracker import NullTracker, Tracker, TrackingCfg
+from pgdm.runs.folder import RunFolder
+from pgdm.runs.tracker import NullTracker, Tracker
+from pgdm.tracking.address import chosen
 
-__all__ = [
-    "TRACKERS",
-    "NullTracker",
-    "RunFolder",
-    "RunLog",
-    "Tracker",
-    "TrackingCfg",
-    "open_tracker",
-]
+__all__ = ["TRACKERS", "NullTracker", "Tracker", "TrackingCfg", "located", "open_tracker"]
+
+
+@dataclass(frozen=True)
+class TrackingCfg:
+    """Where a run is mirrored to; its own folder is complete without it."""
+
+    kind: str
+    """``mlflow`` or ``none``."""
+    uri: str | None
+    """Tracking server or database, such as ``http://host:5000`` or ``sqlite:////data/mlflow.db``;
+    None: that of ``MLFLOW_TRACKING_URI``, else the file ``mlflow.db`` in the folder of runs."""
+    experiment: str
+    """MLflow experiment that groups the runs."""
+
 
 Facts = Mapping[str, Any]
 Builder = Callable[[TrackingCfg, RunFolder, Facts], Tracker]
@@ -31,16 +38,31 @@ def _mlflow(cfg: TrackingCfg, folder: RunFolder, facts: Facts) -> Tracker:
 
 
 TRACKERS: dict[str, Builder] = {"mlflow": _mlflow, "none": lambda *_: NullTracker()}
-"""Kind of tracker to what builds it."""
+"""Kind of tracker to the function that builds it."""
+
+
+def located(cfg: TrackingCfg, notify: Callable[[str], object]) -> TrackingCfg:
+    """Return a configuration with the absolute address of the store that the user names, if any.
+
+    Args:
+        cfg: as the user wrote it.
+        notify: called with a sentence if the store is that of ``MLFLOW_TRACKING_URI``.
+
+    Raises:
+        ConfigError: if MLflow cannot use that store.
+    """
+    return (
+        cfg if cfg.kind != "mlflow" else replace(cfg, uri=chosen(cfg.uri, "tracking.uri", notify))
+    )
 
 
 def open_tracker(cfg: TrackingCfg, folder: RunFolder, facts: Facts) -> Tracker:
-    """Return the tracker that a configuration asks for.
+    """Return the tracker that a configuration names.
 
     Args:
         cfg: which one, and where to.
-        folder: the run, with its ``config.yaml`` and, when resumed, the records it continues.
-        facts: what the configuration does not tell, see ``run_folder.FACTS``; None where unknown.
+        folder: the run, with its ``config.yaml`` and, when resumed, its earlier records.
+        facts: values of `pgdm.runs.folder.FACTS` before there is a result; None where unknown.
 
     Raises:
         UnknownNameError: if there is no such kind.

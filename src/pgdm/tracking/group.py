@@ -1,24 +1,23 @@
-"""A run of MLflow under which others are shown, such as the jobs of a sweep."""
+"""An MLflow run under which others are nested, such as the jobs of a sweep."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
-from pgdm.errors import TrackingError
-from pgdm.tracking.mlflow import STATUS, Store, find_run
-from pgdm.tracking.run_folder import LINK, PARENT, RunFolder, read_json, write_json
+from pgdm.runs.files import LINK, read_json, write_json
+from pgdm.runs.folder import PARENT, RunFolder
+from pgdm.tracking.mlflow import STATUS, Store, find_run, one_line_errors
 from pgdm.tracking.sync import sync_run
 
 
 class Group:
-    """One such run. Every method that talks to MLflow raises TrackingError if that fails.
+    """Such a run. Methods raise TrackingError if MLflow fails.
 
     Args:
-        folder: of the group; its ``mlflow.json`` says which run it is.
+        folder: of the group; its ``mlflow.json`` names the run.
         uri: store of the group.
-        experiment: in which its runs are.
+        experiment: MLflow experiment of its runs.
     """
 
     def __init__(self, folder: Path, uri: str, experiment: str) -> None:
@@ -26,14 +25,14 @@ class Group:
 
     @property
     def opened(self) -> bool:
-        """Whether its run was made in this store."""
+        """Whether its run was created in this store."""
         return self._link.get("uri") == self.uri
 
     def open(self, name: str, tags: Mapping[str, str]) -> None:
-        """Make store, experiment and run if they are missing, and say that it is running."""
+        """Create store, MLflow experiment and run if missing, and set the status to running."""
         from mlflow.entities import RunTag
 
-        with _told(self.uri):
+        with one_line_errors(f"MLflow at {self.uri}"):
             store = Store.open(self.uri, self._experiment)
             folder = RunFolder(self.folder)
             mine = {**folder.origin(), "kind": "sweep", **tags}
@@ -47,31 +46,31 @@ class Group:
         write_json(self.folder / LINK, {**link, "status": "running"})
 
     def adopt(self, run_dir: Path) -> None:
-        """Have the run of a folder shown under this one, in the same store."""
+        """Nest the run of a folder under this one, in the same store."""
         run_dir.mkdir(parents=True, exist_ok=True)
         parent = {"run_id": self._link.get("run_id"), "uri": self.uri}
         write_json(run_dir / LINK, {**read_json(run_dir / LINK), PARENT: parent})
 
     def correct(self, run_dir: Path) -> None:
-        """Give a run that was killed the status that its folder tells, if it is of this group."""
+        """Give a run of a group the status of its folder, if the run was killed."""
         folder = RunFolder(run_dir)
         status = folder.status()
         if not folder.parent() or status == "running":
             return
-        with _told(self.uri):
+        with one_line_errors(f"MLflow at {self.uri}"):
             store = Store.open(self.uri, self._experiment)
-            if status == "finished":  # nobody else tells the rest, or even that it was there
+            if status == "finished":  # it could not send its last records, or any
                 sync_run(store, folder)
                 return
-            # Its folder may not name it: it was killed before it could write that down.
+            # It may have been killed before it wrote mlflow.json.
             run = find_run(store, folder)
             if run is not None and run.info.status == STATUS["running"]:
                 ended_ms = int(1000 * folder.modified())
                 store.client.set_terminated(run.info.run_id, STATUS[status], ended_ms)
 
     def close(self, status: str) -> None:
-        """Say how it ended: ``finished``, ``interrupted`` or ``failed``."""
-        with _told(self.uri):
+        """Set how it ended: ``finished``, ``interrupted`` or ``failed``."""
+        with one_line_errors(f"MLflow at {self.uri}"):
             client = Store.open(self.uri, self._experiment).client
             client.set_terminated(str(self._link.get("run_id")), STATUS[status])
         write_json(self.folder / LINK, {**self._link, "status": status})
@@ -79,14 +78,3 @@ class Group:
     @property
     def _link(self) -> dict[str, str]:
         return read_json(self.folder / LINK)
-
-
-@contextlib.contextmanager
-def _told(uri: str) -> Iterator[None]:
-    from mlflow.exceptions import MlflowException
-
-    try:
-        yield
-    except (MlflowException, OSError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise TrackingError(f"MLflow at {uri}: {reason}") from error

@@ -1,4 +1,4 @@
-"""The tracker that mirrors a run to MLflow while it goes on."""
+"""The tracker that mirrors a run to MLflow while it trains."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pgdm.tracking.mlflow import SYNCED, Mirror, Store, find_run, store_uri
-from pgdm.tracking.run_folder import FACTS, RunFolder, runs_root
+from pgdm.runs.files import VIDEOS
+from pgdm.runs.folder import FACTS, RunFolder, runs_root
+from pgdm.runs.tracker import Tracker
+from pgdm.tracking.mlflow import SYNCED, Mirror, Store, find_run, first_line, is_own, store_uri
 from pgdm.tracking.sync import history, lacking
 from pgdm.tracking.thin import Point, Thin, points
-from pgdm.tracking.tracker import Tracker, TrackingCfg
+
+if TYPE_CHECKING:
+    from pgdm.tracking import TrackingCfg
 
 RETRY_S = 30.0
 """Pause after a failure, before MLflow is tried again."""
@@ -25,20 +29,24 @@ _log = logging.getLogger(__name__)
 
 
 class MlflowTracker(Tracker):
-    """Mirrors a run from a thread of its own, so that training never waits for MLflow.
+    """Mirrors a run from its own thread, so that training never waits for MLflow.
 
-    Importing MLflow alone takes two seconds. Whatever fails there is warned of once and tried
-    again later; what is still missing at the end, ``pgdm runs sync`` fills in from the folder.
+    Importing MLflow alone takes two seconds. A failure is reported once and retried later;
+    ``pgdm runs sync`` fills in from the folder what is still missing at the end.
 
     Args:
         cfg: where to.
-        folder: the run, with ``config.yaml`` and, when it is resumed, the records it continues.
-        facts: what the folder does not tell yet, see ``run_folder.FACTS``; None where unknown.
+        folder: the run, with ``config.yaml`` and, when resumed, its earlier records.
+        facts: values of `pgdm.runs.folder.FACTS` before there is a result; None where unknown.
     """
 
     def __init__(self, cfg: TrackingCfg, folder: RunFolder, facts: Mapping[str, Any]) -> None:
         self._cfg, self._folder = cfg, folder
-        self._uri = cfg.uri or folder.parent().get("uri") or store_uri(runs_root(folder.path))
+        group = folder.parent().get("uri", "")
+        own = group if is_own(group, folder.path) else store_uri(runs_root(folder.path))
+        self._uri = cfg.uri or own
+        place = f" --uri {cfg.uri}" if cfg.uri else ""
+        self._cure = f"pgdm runs sync {runs_root(folder.path)}{place}"
         self._facts = {name: facts[name] for name in FACTS if facts.get(name) is not None}
         self._attempts = int(folder.link.get("attempts", 0)) + 1
         self._earlier = self._folder.log.read()
@@ -58,20 +66,17 @@ class MlflowTracker(Tracker):
             self._send()
 
     def video(self, path: Path, poster: Path, frames: int) -> None:
-        """Copy a film, and show its poster on the run's page; what is gone by then is left out."""
+        """Copy a video, and show its poster on the run's page; skip files removed by then."""
         self._videos.append((path, poster, frames))
         self._send()
 
     def finish(self, status: str, patience_s: float = 60.0) -> None:
-        """Send what is left, then the folder's files and the status."""
+        """Send what is still queued, then the folder's files and the status."""
         last = self._pool.submit(self._end, status)
         wait([last], patience_s)
         self._pool.shutdown(wait=False, cancel_futures=True)
         if not last.done() or last.exception() is not None:
-            _log.warning(
-                "MLflow lacks the end of this run; `pgdm runs sync %s` fills it in",
-                runs_root(self._folder.path),
-            )
+            _log.warning("MLflow lacks the last records of this run; `%s` adds them", self._cure)
 
     def _send(self) -> None:
         self._pool.submit(self._flush).add_done_callback(self._note)
@@ -82,17 +87,18 @@ class MlflowTracker(Tracker):
             return
         self._warned = True
         _log.warning(
-            "MLflow at %s: %s: %s; training goes on, and `pgdm runs sync` fills in what is missing",
+            "MLflow at %s: %s: %s; training continues, and `%s` adds what is missing",
             self._uri,
             type(error).__name__,
-            (str(error).splitlines() or [""])[0],
+            first_line(error),
+            self._cure,
         )
 
     def _flush(self) -> None:
-        """Send what waits; what could not be sent stays in the queues."""
+        """Send what is queued; what cannot be sent stays in the queues."""
         if time.monotonic() < self._not_before:
             return
-        self._not_before = time.monotonic() + RETRY_S  # unless all goes well
+        self._not_before = time.monotonic() + RETRY_S  # reset below if nothing fails
         mirror = self._connected()
         while self._points:
             some = [self._points[i] for i in range(min(_POINTS_A_CALL, len(self._points)))]
@@ -102,14 +108,14 @@ class MlflowTracker(Tracker):
         while self._videos:
             path, poster, frames = self._videos[0]
             if path.exists():
-                mirror.artifact(path, "videos")
+                mirror.artifact(path, VIDEOS)
             if poster.exists():
                 mirror.poster(poster, frames)
             self._videos.popleft()
         self._not_before = 0.0
 
     def _connected(self) -> Mirror:
-        """Return the mirror, opened at the first call; what is missing of earlier comes first."""
+        """Return the mirror; the first call opens it and sends the earlier records it lacks."""
         if self._mirror is not None:
             return self._mirror
         store = Store.open(self._uri, self._cfg.experiment)
@@ -123,7 +129,7 @@ class MlflowTracker(Tracker):
                 mirror.posters()
         else:
             mirror.set_status("running")
-            # MLflow was out of reach before, maybe, or the process was killed.
+            # MLflow may have been out of reach, or the process was killed.
             mirror.log(lacking(earlier, history(store, run)))
         mirror.describe({"attempts": str(self._attempts)})
         mirror.artifacts()
@@ -134,7 +140,7 @@ class MlflowTracker(Tracker):
         self._not_before = 0.0
         self._flush()
         mirror = self._connected()
-        self._folder = RunFolder(self._folder.path)  # with the result that was written since
+        self._folder = RunFolder(self._folder.path)  # with the result written meanwhile
         mirror.refresh(self._folder)
         mirror.describe({SYNCED: self._folder.fingerprint()})
         mirror.artifacts()

@@ -1,4 +1,4 @@
-"""What each logged number means, in one table: MLflow's descriptions and the docs show it."""
+"""The meaning of each logged metric, as one table for MLflow's descriptions and the docs."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ METRICS = (
     Metric("lifted", "both", "0..1", "of steps with a raised target, share with a raised object"),
     Metric("dropped", "both", "0..1", "share of episodes that lifted the object and lost it again"),
     Metric("length", "both", "steps", "control steps until the episode ended (25 a second)"),
-    Metric("return", "both", "reward", "sum of the task's own rewards of an episode"),
-    Metric("shaping", "train", "reward", "sum of what the training adds to them (shaping=...)"),
+    Metric("return", "both", "reward", "sum of the task's own rewards over an episode"),
+    Metric("shaping", "train", "reward", "sum of the rewards that shaping=... adds in training"),
     Metric("raw/<name>", "both", "-", "sum of a reward term over the episode, before weighting"),
-    Metric("term/<name>", "both", "reward", "part of the return that a weighted term gave"),
-    Metric("end/<name>", "both", "0..1", "share of episodes that this condition ended"),
+    Metric("term/<name>", "both", "reward", "contribution of a weighted reward term to the return"),
+    Metric("end/<name>", "both", "0..1", "share of episodes that this termination ended"),
     Metric(
         "hand_error_m", "both", "m", "mean distance of fingertips from the expert's, over the steps"
     ),
@@ -53,27 +53,34 @@ METRICS = (
         "reward",
         "train",
         "reward",
-        "mean reward of a step, with what the shaping adds (`return` is without it)",
+        "mean reward per step, shaping included (`return` excludes it)",
     ),
     Metric("weight/<name>", "train", "-", "weight of a reward term that has a schedule"),
-    Metric("steps_per_s", "train", "1/s", "environment steps a second, learning included"),
-    Metric("loss_policy", "train", "-", "loss of the policy: PPO's clipped one, SAC's own"),
-    Metric("loss_critic", "train", "-", "SAC: squared error of the critics, summed over them"),
+    Metric("steps_per_s", "train", "1/s", "environment steps per second, learning included"),
+    Metric("loss_policy", "train", "-", "policy loss: PPO's clipped objective or SAC's"),
+    Metric("loss_critic", "train", "-", "SAC: squared errors of the critics, summed"),
     Metric("temperature", "train", "-", "SAC: weight of the entropy in the return"),
     Metric("loss_value", "train", "reward^2", "squared error of the value, unweighted"),
     Metric("entropy", "train", "nat", "entropy of the action distribution"),
-    Metric("kl", "train", "nat", "approximate divergence of the policy from before its update"),
+    Metric("kl", "train", "nat", "approximate KL divergence from the policy before its update"),
     Metric("clip_fraction", "train", "0..1", "share of samples whose ratio was clipped"),
-    Metric("explained_variance", "train", "<=1", "variance of the returns the value explains"),
+    Metric(
+        "explained_variance",
+        "train",
+        "<=1",
+        "share of the returns' variance that the value explains",
+    ),
     Metric("ess", "train", "0..1", "effective sample size of the importance weights, as a share"),
     Metric("grad_norm", "train", "-", "norm of the gradient before clipping"),
-    Metric("action_std", "train", "-", "mean standard deviation of the actions (range -1..1)"),
+    Metric(
+        "action_std", "train", "-", "mean standard deviation of the actions, whose range is -1..1"
+    ),
     Metric("lr", "train", "-", "learning rate"),
 )
 
 
 def markdown() -> str:
-    """Return the table for people: metric, unit, meaning; steps are frames."""
+    """Return the table in Markdown: metric, unit, meaning, groups."""
     groups = {
         "train": "`train/`",
         "eval": "`eval_*/`",
@@ -83,8 +90,8 @@ def markdown() -> str:
         f"| `{m.name}` | {m.unit} | {m.meaning} | {groups[m.groups]} |" for m in METRICS
     )
     return (
-        "Step of every metric: frames, that is environment steps of all simulations together. "
-        "`train/` is of the episodes that ended in an iteration; `eval_sampled/` draws actions "
+        "The step of every metric is in frames: control steps, summed over all simulations. "
+        "`train/` covers the episodes that ended in an iteration; `eval_sampled/` draws actions "
         "(as the paper does), `eval_deterministic/` takes the mean action.\n\n"
         f"| metric | unit | meaning | groups |\n|---|---|---|---|\n{rows}\n"
     )

@@ -1,11 +1,13 @@
-"""MLflow: a store, and one run in it. Everything here talks to MLflow at once and waits."""
+"""MLflow: a store, and one run in it. Every call here blocks until MLflow has answered."""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import os
 import shutil
+import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -14,11 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
+from pgdm import files
 from pgdm.errors import TrackingError
-from pgdm.paths import TEMPORARY, replacing
+from pgdm.paths import TEMPORARY, as_name, inside, replacing
+from pgdm.runs.config_file import as_text, dotted
+from pgdm.runs.files import LINK, LOG, VIDEOS, write_json
+from pgdm.runs.folder import ARTIFACTS, RunFolder
 from pgdm.tracking import metric_names
-from pgdm.tracking.run_folder import ARTIFACTS, LINK, RunFolder, flatten, write_json
-from pgdm.tracking.run_log import FILE_NAME
 from pgdm.tracking.thin import Point
 
 if TYPE_CHECKING:
@@ -28,7 +32,7 @@ if TYPE_CHECKING:
 DATABASE = "mlflow.db"
 PARENT_TAG = "mlflow.parentRunId"
 SYNCED = "synced"
-"""Tag with the fingerprint of the records that are in MLflow, all of them."""
+"""Tag with the fingerprint of the run whose records MLflow has completely."""
 STATUS = {
     "running": "RUNNING",
     "finished": "FINISHED",
@@ -36,10 +40,9 @@ STATUS = {
     "killed": "KILLED",
     "failed": "FAILED",
 }
-_BATCH = 1000  # metrics in one call, the server's limit
-_PARAMS = 100  # parameters in one call, likewise
-_MACHINE_KEYS = ("run_dir", "resume")  # where a run lies is a tag: it may move
-# Without it the pages open as those of a language model's traces.
+_BATCH, _PARAMS = 1000, 100  # the server's limits: metrics and parameters per call
+_MACHINE_KEYS = ("run_dir", "resume")  # no parameters: the folder is a tag, as it may move
+# Without it the pages open on traces of language models.
 _EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}
 _LOCK_S = 120.0
 _SETTINGS = {
@@ -47,7 +50,7 @@ _SETTINGS = {
     "DO_NOT_TRACK": "true",
     "GIT_PYTHON_REFRESH": "quiet",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",  # stdout is for results
-    # A server that does not answer is tried again by the tracker, not waited for in a call.
+    # If a server does not answer, the tracker retries later instead of waiting in the call.
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
 }
@@ -58,14 +61,24 @@ def store_uri(root: Path) -> str:
     return f"sqlite:///{root.absolute() / DATABASE}"
 
 
+def is_own(uri: str, folder: Path) -> bool:
+    """Return whether a store is the SQLite store of a folder, or of one that it is in.
+
+    Only such a store is used because a file in the folder names it: somebody else may have made it.
+    """
+    file, real = sqlite_file(uri), folder.resolve()
+    at = None if file is None else file.parent.resolve()
+    return file is not None and file.name == DATABASE and at in (real, *real.parents)
+
+
 def environment() -> dict[str, str]:
-    """Return the environment for MLflow: it sends nothing about its use to anybody."""
+    """Return the environment for MLflow's processes, with its usage reports switched off."""
     return {**_SETTINGS, **os.environ}
 
 
 @dataclass(frozen=True)
 class Store:
-    """An MLflow store, ready for runs of one experiment."""
+    """An MLflow store, ready for runs of one MLflow experiment."""
 
     client: MlflowClient
     uri: str
@@ -73,10 +86,10 @@ class Store:
 
     @classmethod
     def open(cls, uri: str, experiment: str) -> Store:
-        """Open a store; a SQLite file and the experiment are made if they are missing.
+        """Open a store; the SQLite file and the experiment are created if missing.
 
-        Any number of processes may do so at once: they take turns, because two that create the
-        same database break each other.
+        Any number of processes may do so at the same time: a lock lets one at a time create the
+        database, as two would corrupt it.
 
         Raises:
             TrackingError: if another process holds the lock for minutes.
@@ -85,17 +98,19 @@ class Store:
         with _only_one(file):
             if file is not None and not file.exists():
                 _create(file)
+            elif file is not None:
+                _check_writable(file)
             client = connect(uri)
             return cls(client, uri, _experiment(client, experiment, file))
 
 
 def connect(uri: str) -> MlflowClient:
-    """Return a quiet client of a store that is there."""
-    os.environ.update({k: v for k, v in _SETTINGS.items() if k not in os.environ})
+    """Return a client of an existing store that logs no progress."""
+    os.environ.update(environment())
     from mlflow import MlflowClient
 
-    # The first two announce each step of making a database; the third one's complaints come
-    # to us as errors as well.
+    # The first two log each step of creating a database; the third one's warnings also reach us
+    # as exceptions.
     for name, level in (("mlflow", "WARNING"), ("alembic", "WARNING"), ("urllib3", "ERROR")):
         logging.getLogger(name).setLevel(level)
     return MlflowClient(tracking_uri=uri)
@@ -103,7 +118,26 @@ def connect(uri: str) -> MlflowClient:
 
 def sqlite_file(uri: str) -> Path | None:
     """Return the file of a SQLite address, or None for another kind of store."""
-    return Path(uri.removeprefix("sqlite:///")) if uri.startswith("sqlite:///") else None
+    file = uri.removeprefix("sqlite:///").partition("?")[0]
+    return Path(file) if uri.startswith("sqlite:///") else None
+
+
+@contextlib.contextmanager
+def one_line_errors(where: str) -> Iterator[None]:
+    """Turn errors of MLflow, its database and files into a TrackingError, ``where: reason``."""
+    os.environ.update(environment())  # before the first import of MLflow
+    from mlflow.exceptions import MlflowException
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        yield
+    except (MlflowException, SQLAlchemyError, OSError, ImportError, ValueError) as error:
+        raise TrackingError(f"{where}: {first_line(error)}") from error
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message, or its type if it has none."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 @contextlib.contextmanager
@@ -112,19 +146,34 @@ def _only_one(file: Path | None) -> Iterator[None]:
         yield
         return
     file.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=file.parent):
+        pass  # a folder that cannot be written is refused at once
     lock = FileLock(f"{file}.lock", timeout=_LOCK_S)
     try:
         lock.acquire()
     except TimeoutError as error:
-        raise TrackingError(f"{file}.lock is held by another process; remove it") from error
+        raise TrackingError(f"{file}.lock is held by another process; stop it") from error
     try:
         yield
     finally:
         lock.release()
 
 
+def _check_writable(file: Path) -> None:
+    """Refuse a file that is no writable database at once: MLflow tries it for two minutes."""
+    with contextlib.closing(sqlite3.connect(f"{file.as_uri()}?mode=rw", uri=True)) as base:
+        try:
+            base.execute("BEGIN IMMEDIATE")
+            base.execute("PRAGMA user_version = 0")  # undone when it is closed
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+                raise OSError(f"{file}: {error}") from error
+        except sqlite3.DatabaseError as error:
+            raise OSError(f"{file}: {error}") from error
+
+
 def _create(file: Path) -> None:
-    """Make a database whole or not at all: MLflow does not go on with a half-made one."""
+    """Create a database atomically: MLflow cannot use one that is half created."""
     for stale in file.parent.glob(f"{TEMPORARY}*{file.name}*"):  # of a process that was killed
         stale.unlink()
     with replacing(file) as temp:
@@ -132,16 +181,16 @@ def _create(file: Path) -> None:
 
 
 def _experiment(client: MlflowClient, name: str, file: Path | None) -> str:
-    """Return the id of an experiment, made or brought back if need be."""
+    """Return the id of an MLflow experiment, created or restored if need be."""
     from mlflow.exceptions import MlflowException
 
     found = client.get_experiment_by_name(name)
     if found is None:
-        place = None if file is None else (file.parent / ARTIFACTS / name).as_uri()
+        place = None if file is None else inside(file.parent, ARTIFACTS, as_name(name)).as_uri()
         tags = {"mlflow.note.content": metric_names.markdown(), **_EXPERIMENT_TAGS}
         try:
             return client.create_experiment(name, artifact_location=place, tags=tags)
-        except MlflowException:  # on a server somebody else may have been faster
+        except MlflowException:  # on a server another process may have been first
             found = client.get_experiment_by_name(name)
             if found is None:
                 raise
@@ -153,8 +202,8 @@ def _experiment(client: MlflowClient, name: str, file: Path | None) -> str:
 def find_run(store: Store, folder: RunFolder) -> Run | None:
     """Return the MLflow run that mirrors a folder, or None.
 
-    It is the one that ``mlflow.json`` names, unless the folder is a copy of one that still
-    exists; without such a file, the newest one that says it came from this folder.
+    It is the one that ``mlflow.json`` names, unless the folder is a copy of another that still
+    exists; otherwise the newest one tagged with this folder and host.
     """
     from mlflow.exceptions import MlflowException
 
@@ -163,7 +212,7 @@ def find_run(store: Store, folder: RunFolder) -> Run | None:
         try:
             run = store.client.get_run(named)
         except MlflowException:
-            run = None  # of another store, or of one that was deleted
+            run = None  # in another store, or deleted
         if run is not None and run.info.lifecycle_stage == "active":
             origin = Path(run.data.tags.get("run_dir", folder.path))
             if origin == folder.path or not origin.exists():
@@ -180,14 +229,15 @@ class Mirror:
     Args:
         store: where to.
         folder: the run.
-        run: its MLflow run; None makes a new one.
+        run: its MLflow run; None creates one.
     """
 
     def __init__(self, store: Store, folder: RunFolder, run: Run | None) -> None:
         self._store, self._client, self._folder = store, store.client, folder
         if run is None:
             start_ms = int(1000 * folder.started())
-            # Named at once: who is killed before the link is written finds it by its folder.
+            # Tagged right away: if the process is killed before it writes mlflow.json, the tags
+            # identify the run.
             run = self._client.create_run(
                 store.experiment_id,
                 start_time=start_ms,
@@ -198,19 +248,23 @@ class Mirror:
         self._params = dict(run.data.params)
 
     def link(self, news: Mapping[str, Any]) -> None:
-        """Note in the folder which run mirrors it, and what else is new."""
+        """Write to the folder which run mirrors it, and ``news``."""
         mine = {"run_id": self.run_id, "uri": self._store.uri}
         write_json(self._folder.path / LINK, {**self._folder.link, **news, **mine})
 
     def refresh(self, folder: RunFolder) -> None:
-        """Go on with the folder read anew."""
+        """Use a folder that was read again."""
         self._folder = folder
 
     def describe(self, tags: Mapping[str, str]) -> None:
-        """Record parameters, tags and the description; a parameter never changes its value."""
+        """Record parameters, tags and the description.
+
+        A parameter cannot change in MLflow: a new value becomes the tag ``now.<name>``.
+        """
         from mlflow.entities import Param, RunTag
 
-        flat = flatten({k: v for k, v in self._folder.config.items() if k not in _MACHINE_KEYS})
+        config = {k: v for k, v in self._folder.config.items() if k not in _MACHINE_KEYS}
+        flat = {name: as_text(value) for name, value in dotted(config).items()}
         new = [Param(name, text) for name, text in flat.items() if name not in self._params]
         changed = {f"now.{n}": t for n, t in flat.items() if self._params.get(n, t) != t}
         texts = {**self._folder.tags(), **tags, **changed}
@@ -235,40 +289,40 @@ class Mirror:
             self._client.log_batch(self.run_id, metrics=metrics[start : start + _BATCH])
 
     def artifacts(self) -> None:
-        """Copy the run's files that are missing there or have another size."""
+        """Copy the run's files that MLflow lacks or has with another size."""
         there: dict[str, dict[str, int | None]] = {}
         for path, place in self._folder.artifacts():
             if place not in there:
                 listed = self._client.list_artifacts(self.run_id, place or None)
                 there[place] = {item.path: item.file_size for item in listed}
             name = f"{place}/{path.name}" if place else path.name
-            with contextlib.suppress(FileNotFoundError):  # an older checkpoint that just went
+            with contextlib.suppress(FileNotFoundError):  # a checkpoint that was just removed
                 if there[place].get(name) != path.stat().st_size:
                     self.artifact(path, place)
 
     def artifact(self, path: Path, place: str) -> None:
         """Copy one file."""
         with tempfile.TemporaryDirectory(prefix="pgdm-") as folder:
-            if path.name == FILE_NAME:
-                # A server takes what is added while it is sent for the start of another request.
+            if path.name == LOG:
+                # It may grow while it is sent, which a server would take for another request.
                 path = Path(shutil.copy2(path, folder))
             self._client.log_artifact(self.run_id, str(path), place or None)
 
     def poster(self, path: Path, frames: int) -> None:
-        """Show a picture on the run's page, with a slider over frames."""
+        """Show a picture on the run's page; a slider there selects the frames."""
         from PIL import Image
 
-        with Image.open(path) as picture:
+        with Image.open(io.BytesIO(files.read_bytes(path))) as picture:
             self._client.log_image(self.run_id, picture, key="evaluation", step=frames)
 
     def posters(self) -> None:
-        """Show the posters of all films in the folder."""
-        for path in sorted((self._folder.path / "videos").glob("*.png")):
+        """Show the posters of all videos in the folder."""
+        for path in sorted((self._folder.path / VIDEOS).glob("*.png")):
             digits = "".join(filter(str.isdigit, path.stem))
             self.poster(path, int(digits or 0))
 
     def set_status(self, status: str, end_s: float | None = None) -> None:
-        """Set the run's status, and when it ended unless it is running."""
+        """Set the run's status and, unless it is running, the time it ended, s since the epoch."""
         if status == "running":
             self._client.update_run(self.run_id, status=STATUS[status])
         else:

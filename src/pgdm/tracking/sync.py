@@ -1,13 +1,17 @@
-"""Rebuild MLflow from run folders: they are the truth, it is a mirror."""
+"""Rebuild MLflow from run folders, which hold the complete records."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pgdm.errors import RunError, TrackingError
+from pgdm.errors import ConfigError, RunError, TrackingError
+from pgdm.runs.folder import RunFolder, check_links, find_runs
+from pgdm.runs.log import metrics_of
+from pgdm.tracking.address import chosen
 from pgdm.tracking.mlflow import (
     PARENT_TAG,
     STATUS,
@@ -15,17 +19,18 @@ from pgdm.tracking.mlflow import (
     Mirror,
     Store,
     find_run,
+    one_line_errors,
     store_uri,
 )
-from pgdm.tracking.run_folder import RunFolder, find_runs
-from pgdm.tracking.run_log import metrics_of
 from pgdm.tracking.thin import Point, points
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
 EXPERIMENT = "pgdm"
-"""Where runs go whose configuration names no experiment."""
+"""MLflow experiment of runs whose configuration names none."""
+
+_log = logging.getLogger(__name__)
 
 History = dict[str, dict[int, float]]
 """Metric to value at each step."""
@@ -33,53 +38,72 @@ History = dict[str, dict[int, float]]
 
 @dataclass(frozen=True)
 class Synced:
-    """What was done about one run."""
+    """What was done for one run."""
 
     folder: RunFolder
     action: str
-    """``created``, ``completed``, ``rebuilt``, ``unchanged``, ``running`` or ``unreadable``."""
+    """``created``, ``completed``, ``rebuilt``, ``unchanged``, ``running``, ``unreadable``, or
+    ``failed``: its store cannot be used."""
     reason: str = ""
 
 
 def sync(
     root: Path, uri: str | None = None, notify: Callable[[Synced], None] = lambda _: None
 ) -> list[Synced]:
-    """Make MLflow show every run of a folder as its own records do.
+    """Make MLflow show every run of a folder as recorded there.
 
-    Doing it again changes nothing. A run that goes on is left to its own process; a run whose
-    records MLflow contradicts is made anew there, and the wrong one moved to MLflow's trash.
+    A second call changes nothing. A running run is left to its own process; a run whose records
+    MLflow contradicts is created again there, and the wrong one moved to MLflow's trash.
 
     Args:
         root: folder of runs.
-        uri: store to fill; None: the one in a run's configuration, or ``mlflow.db`` in ``root``.
-        notify: told of each run.
+        uri: store to fill; None: that of ``MLFLOW_TRACKING_URI``, or ``mlflow.db`` in ``root``.
+            What a run's own settings name is not written to: somebody else may have made the run.
+        notify: called after each run; one that cannot be synced keeps no other from it.
 
     Raises:
-        TrackingError: if a store cannot be used.
+        ConfigError: if ``uri`` or ``MLFLOW_TRACKING_URI`` is no store of MLflow's.
+        TrackingError: in the end, if runs could not be synced.
     """
-    from mlflow.exceptions import MlflowException
-
-    stores: dict[tuple[str, str], Store] = {}
-    done = []
+    stores: dict[tuple[str, str], Store | TrackingError] = {}
+    done, place = [], chosen(uri, "--uri", _log.warning) or store_uri(root)
     for folder in find_runs(root):
         try:
-            place = uri or folder.setting("tracking.uri") or store_uri(root)
-            key = (str(place), str(folder.setting("tracking.experiment") or EXPERIMENT))
-            if key not in stores:
-                stores[key] = Store.open(*key)
-            outcome = sync_run(stores[key], folder)
+            check_links(folder.path)
+            experiment = str(folder.setting("tracking.experiment") or EXPERIMENT)
+            store = _opened(stores, place, experiment)
+            with one_line_errors(f"MLflow at {place}, run {folder.path}"):
+                outcome = sync_run(store, folder)
         except RunError as error:
             outcome = Synced(folder, "unreadable", str(error))
-        except (MlflowException, OSError) as error:
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise TrackingError(f"MLflow at {place}, run {folder.path}: {reason}") from error
+        except (ConfigError, TrackingError) as error:
+            outcome = Synced(folder, "failed", str(error))
         notify(outcome)
         done.append(outcome)
+    if failed := [one.reason for one in done if one.action == "failed"]:
+        raise TrackingError(
+            f"{len(failed)} of {len(done)} runs could not be synced: {failed[0]}; pgdm runs sync "
+            "--uri URI names another store"
+        )
     return done
 
 
+def _opened(stores: dict[tuple[str, str], Store | TrackingError], uri: str, name: str) -> Store:
+    """Return a store, opened once; one that is out of reach is not waited for again."""
+    if (uri, name) not in stores:
+        try:
+            with one_line_errors(f"MLflow at {uri}"):
+                stores[uri, name] = Store.open(uri, name)
+        except TrackingError as error:
+            stores[uri, name] = error
+    found = stores[uri, name]
+    if isinstance(found, TrackingError):
+        raise found
+    return found
+
+
 def sync_run(store: Store, folder: RunFolder) -> Synced:
-    """Make MLflow show one run as its own records do."""
+    """Make MLflow show one run as recorded in its folder."""
     run = find_run(store, folder)
     status = folder.status()
     if run is not None and status == "running":
@@ -109,15 +133,15 @@ def sync_run(store: Store, folder: RunFolder) -> Synced:
 
 
 def _complete(run: Run, folder: RunFolder, fingerprint: str) -> bool:
-    """Return whether a run has all records of a folder, its status and its parent."""
+    """Return whether an MLflow run has all records of a folder, its status and its parent."""
     tags, parent = run.data.tags, folder.parent().get("run_id")
     nested = parent in (None, tags.get(PARENT_TAG))
-    told = run.info.status == STATUS[folder.status()]
-    return nested and told and tags.get(SYNCED) == fingerprint
+    same_status = run.info.status == STATUS[folder.status()]
+    return nested and same_status and tags.get(SYNCED) == fingerprint
 
 
 def history(store: Store, run: Run) -> History:
-    """Return what a run shows: the last value of each metric at each step."""
+    """Return the records of an MLflow run: the last value of each metric at each step."""
     found: History = {}
     for name in run.data.metrics:
         entries = store.client.get_metric_history(run.info.run_id, name)
@@ -126,7 +150,7 @@ def history(store: Store, run: Run) -> History:
 
 
 def lacking(wanted: list[Point], there: History) -> list[Point]:
-    """Return the points without the metrics that are there."""
+    """Return the points without the metrics that MLflow has."""
     return [
         (step, at, {name: value for name, value in m.items() if step not in there.get(name, {})})
         for step, at, m in wanted
@@ -134,7 +158,7 @@ def lacking(wanted: list[Point], there: History) -> list[Point]:
 
 
 def _contradicts(there: History, folder: RunFolder) -> bool:
-    """Return whether MLflow shows something that the run's records do not say."""
+    """Return whether MLflow shows a value that is not in the run's records."""
     truth = {
         (name, int(record["frames"])): value
         for record in folder.log.read()

@@ -1,21 +1,21 @@
-"""Which points of a run MLflow shows, whose pages get slow beyond; the run log keeps all."""
+"""Thins a run's points for MLflow, whose pages get slow with many; the run folder keeps all."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from pgdm.tracking.run_folder import RunFolder
-from pgdm.tracking.run_log import Record, metrics_of
+from pgdm.runs.folder import RunFolder
+from pgdm.runs.log import Record, metrics_of
 
 MAX_POINTS = 1500
-"""Points of one metric at most."""
+"""Most points of one metric."""
 
 Point = tuple[int, int, dict[str, float]]
 """Frames, time in ms since the epoch, and finite metrics by name."""
 
 
 class Thin:
-    """Passes at most ``MAX_POINTS`` points of a run, and every evaluation.
+    """Passes at most ``MAX_POINTS`` points of a run, plus every evaluation.
 
     Args:
         total_frames: the run's length.
@@ -26,14 +26,14 @@ class Thin:
         self._bucket = -1
 
     def passes(self, frames: int, metrics: Mapping[str, float]) -> bool:
-        """Return whether to mirror this point; points come in the order of frames."""
+        """Return whether to mirror this point; points must come in the order of frames."""
         bucket, before = frames // self._stride, self._bucket
         self._bucket = bucket
         return bucket != before or any(name.startswith("eval") for name in metrics)
 
 
 def points(folder: RunFolder, records: Iterable[Record]) -> list[Point]:
-    """Return what of a run's records MLflow shows."""
+    """Return the points of a run's records that MLflow shows."""
     thin, start = Thin(folder.total_frames()), folder.started()
     found = []
     for record in records:

@@ -1,1 +1,1 @@
-"""Where the wrist should go for the object to follow its exemplar motion."""
+"""Paths and plans of the hand's base with which the hand follows an exemplar motion."""

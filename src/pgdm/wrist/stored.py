@@ -1,43 +1,40 @@
-"""Wrist plans kept: each is made once, by the run that needs it first."""
+"""Stored wrist plans: the first run that needs one computes it."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from pgdm import paths
-from pgdm.errors import CorruptAssetError, LibraryError, PlanMissingError
-from pgdm.library import safe_npz, staging
-from pgdm.library.report import Progress
+from pgdm.errors import CorruptAssetError, LibraryError
+from pgdm.library import staging
+from pgdm.library.files import npz as safe_npz
+from pgdm.library.progress import Notify, StepProgress
 from pgdm.wrist.plan import WristPlan, WristProblem, plan_wrist
 
 FILE = "wrist.npz"
-"""Name of a run's own copy: a policy goes with the commands that it was trained on."""
+"""A run's own copy: a policy needs the commands that it was trained on."""
 _FOLDER = "wrist"
-_STEP = "wrist plan"
-
-Notify = Callable[[str], None]
 
 
 def path_of(library: Path, problem: WristProblem) -> Path:
-    """Return where the library in a folder keeps a problem's plan, or would."""
-    name = f"{problem.scene.task.id}-{problem.scene.hand.name}-{problem.key()[:16]}.npz"
-    return library / _FOLDER / name
+    """Return where a library folder stores the plan of a problem; it may not exist."""
+    name = f"{problem.scene.task.id}-{problem.scene.hand.name}-{problem.key()[:16]}"
+    return paths.inside(library / _FOLDER, name, suffix=".npz")
 
 
 class WristPlans:
-    """Gives the plan of a problem: a run's own, the library's, or a new one.
+    """Gives the plan of a problem: a run's own copy, else the library's, else a new one.
 
     Args:
         library: its folder.
-        run: a run's folder, whose copy goes first; None for none.
-        notify: told in a sentence what is made, or damaged.
-        progress: told how far it is; None: plans that are missing are not made.
-        num_threads: 0 takes one per core.
+        run: folder of a run; None for none.
+        notify: called with a sentence on what is computed, missing or damaged.
+        progress: called with the planner's progress; None: missing plans are not computed.
+        num_threads: number of threads of the planner; 0 takes one per core.
     """
 
     def __init__(
@@ -45,49 +42,45 @@ class WristPlans:
         library: Path,
         run: Path | None,
         notify: Notify,
-        progress: Progress | None,
+        progress: StepProgress | None,
         num_threads: int = 0,
     ) -> None:
         self._library, self._run, self._notify = library, run, notify
         self._progress, self._threads = progress, num_threads
 
-    def __call__(self, problem: WristProblem) -> WristPlan:
-        """Return a problem's plan.
+    def __call__(self, problem: WristProblem) -> WristPlan | None:
+        """Return a problem's plan; None if it is missing and must not be computed.
 
         Raises:
             ConfigError: the motion is too short for the hold, or too long to plan.
-            PlanMissingError: it is not there, and is not to be made.
         """
         problem.check()
-        stored = path_of(self._library, problem)
-        # A run goes on with its own, whatever the version of planner or simulator is by now.
-        own = (
-            None if self._run is None else self._found(self._run / FILE, problem, any_version=True)
-        )
+        stored, own = path_of(self._library, problem), None
+        if self._run is not None:  # valid whatever the version of planner or MuJoCo is by now
+            own = self._found(self._run / FILE, problem, any_version=True)
         if (plan := own or self._found(stored, problem)) is not None:
             return plan
         task = problem.scene.task.id
         if self._progress is None:
-            raise PlanMissingError(
+            self._notify(
                 f"no wrist plan of '{task}' is stored yet; the run computes one first (10-40 s)"
             )
+            return None
         try:
             with staging.making(stored, self._notify):
                 with suppress(CorruptAssetError):  # another process was first
                     return read(stored, problem)
                 plan = self._plan(problem, self._progress)
                 write(stored, plan, problem)
-        except LibraryError as error:  # a library that others own
-            self._notify(f"{error}; the wrist plan of '{task}' is kept with the run alone")
+        except LibraryError as error:  # a library that belongs to another user
+            self._notify(f"{error}; the wrist plan of '{task}' is stored with the run only")
             plan = plan or self._plan(problem, self._progress)
         return plan
 
-    def _plan(self, problem: WristProblem, progress: Progress) -> WristPlan:
+    def _plan(self, problem: WristProblem, progress: StepProgress) -> WristPlan:
         task = problem.scene.task.id
-        self._notify(f"computing the wrist plan of '{task}' (once; it is kept in the library)")
-        plan = plan_wrist(
-            problem, self._threads, lambda done, rounds: progress(_STEP, done, rounds)
-        )
+        self._notify(f"computing the wrist plan of '{task}' (once; the library stores it)")
+        plan = plan_wrist(problem, self._threads, progress)
         self._notify(f"wrist plan of '{task}', {plan.seconds:.0f} s: {plan.described()}")
         return plan
 
@@ -102,7 +95,7 @@ class WristPlans:
 
 
 def write(path: Path, plan: WristPlan, problem: WristProblem) -> None:
-    """Write a plan, whole or not at all.
+    """Write a plan atomically.
 
     Raises:
         LibraryError: it cannot be written.
@@ -123,9 +116,9 @@ def read(path: Path, problem: WristProblem, any_version: bool = False) -> WristP
     """Read a problem's plan.
 
     Args:
-        path: of the file.
+        path: path of the file.
         problem: that it solves.
-        any_version: whether it will do that the plan begins where the problem does.
+        any_version: whether a plan that only shares the problem's start state is accepted.
 
     Raises:
         CorruptAssetError: the file is missing, damaged, or of another problem.
@@ -139,15 +132,15 @@ def read(path: Path, problem: WristProblem, any_version: bool = False) -> WristP
     same_start = np.array_equal(arrays["qpos"][0], problem.qpos)
     if not (same_start and (any_version or np.array_equal(arrays.get("key", []), _key(problem)))):
         raise CorruptAssetError(
-            f"{path} was computed for another task, hand, start, hold or load, or with another "
-            "version of planner or MuJoCo"
+            f"{path} was computed for another task, hand, start state, hold or load, or with "
+            "another version of planner or MuJoCo"
         )
     frames, seconds = arrays["effort"].tolist()
     return WristPlan(arrays["commands"], arrays["qpos"], arrays["error_m"], int(frames), seconds)
 
 
 def _is_finite(array: object, shape: tuple[int, ...]) -> bool:
-    # Of one type: the hash of the commands is over their bytes.
+    # One type only: the hash of the commands is over their bytes.
     if not (isinstance(array, np.ndarray) and array.dtype == np.float64):
         return False
     return array.shape == shape and bool(np.isfinite(array).all())

@@ -1,1 +1,1 @@
-"""Pre-grasps posed by a person: the model behind the page, and the page in the browser."""
+"""Pre-grasps posed by a person on a page in the browser."""

@@ -1,22 +1,31 @@
-"""Keeps the labeler's server to this machine's own page."""
+"""Restricts the labeler's server to the page of this machine's own browser.
+
+The only module that uses viser's private interface, which may change with any version.
+"""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from typing import Any
 
 import rich
 import viser
-from viser import _messages
 from viser.infra import WebsockClientConnection
 
+from pgdm.errors import PgdmError
+
 HOST = "127.0.0.1"
-"""Only this machine: the page asks for no password."""
+"""Only this machine: the page has no password."""
+VISER = "1.1.1"
+"""Version of viser whose private interface :func:`secure` was checked against."""
+_TUNNELS = ("ShareUrlRequest", "ShareUrlDisconnect")
+"""Messages by which a page makes the server publish itself through a tunnel, and stop that."""
 
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Keep viser's own words from the terminal, while inside."""
+    """Suppress viser's messages on the terminal inside the context."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:
@@ -26,35 +35,64 @@ def quietly() -> Iterator[None]:
 
 
 def open_server(port: int) -> viser.ViserServer:
-    """Start a server that only this machine's own page can use.
-
-    viser lets any page that the user's browser shows connect to it, and has it publish itself by
-    a tunnel if that page asks for it. Here connections from other pages are closed, and no message
-    opens a tunnel.
+    """Start a server that only a page of this machine can use.
 
     Args:
-        port: to listen at; viser takes the next free one if it is taken.
+        port: port to listen at; viser takes the next free one if it is taken.
+
+    Raises:
+        PgdmError: the installed viser cannot be secured.
     """
     with quietly():
         server = viser.ViserServer(HOST, port, label="pgdm labeler", verbose=False)
-    inner = server._websock_server
-    for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
-        inner.unregister_handler(message)
-    allowed = {f"http://{name}:{server.get_port()}" for name in (HOST, "localhost")}
-
-    async def check(connection: WebsockClientConnection) -> None:
-        socket = inner._live_connections.get(connection.client_id)
-        request = None if socket is None else socket.request
-        origin = None if request is None else request.headers.get("Origin")
-        # Programs send none; browsers always do, and their pages cannot change it.
-        if socket is not None and origin is not None and origin not in allowed:
-            await socket.close(1008, "pages of other sites may not use the labeler")
-
-    inner._client_connect_cb.insert(0, check)
+    try:
+        secure(server)
+    except PgdmError:
+        close_server(server)
+        raise
     return server
 
 
+def secure(server: viser.ViserServer) -> None:
+    """Have a server refuse pages of other sites, and tunnels.
+
+    By default viser accepts connections from any page that the user's browser shows, and publishes
+    itself through a tunnel if such a page requests it.
+
+    Raises:
+        PgdmError: the private interface of the installed viser is another than expected.
+    """
+    inner: Any = getattr(server, "_websock_server", None)
+    handlers, callbacks, connections = (
+        getattr(inner, name, None)
+        for name in ("_incoming_handlers", "_client_connect_cb", "_live_connections")
+    )
+    if (
+        not isinstance(handlers, dict)
+        or not isinstance(callbacks, list)
+        or not isinstance(connections, dict)
+        or not set(_TUNNELS) <= {message.__name__ for message in handlers}
+    ):
+        raise PgdmError(
+            f"viser {viser.__version__} cannot be restricted to this machine's page: its private "
+            f"interface differs from that of {VISER}; install it with 'pip install viser=={VISER}'"
+        )
+    for message in [message for message in handlers if message.__name__ in _TUNNELS]:
+        del handlers[message]
+    allowed = {f"http://{name}:{server.get_port()}" for name in (HOST, "localhost")}
+
+    async def check(connection: WebsockClientConnection) -> None:
+        # Browsers always send their page's origin, which the page cannot change; programs send
+        # none. A connection that is not found here raises, which closes it.
+        socket = connections[connection.client_id]
+        origin = socket.request.headers.get("Origin")
+        if origin is not None and origin not in allowed:
+            await socket.close(1008, "pages of other sites may not use the labeler")
+
+    callbacks.insert(0, check)
+
+
 def close_server(server: viser.ViserServer) -> None:
-    """End a server and its connections."""
+    """Stop a server and close its connections."""
     with quietly():
         server.stop()

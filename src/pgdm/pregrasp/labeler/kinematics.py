@@ -1,29 +1,28 @@
-"""From where the wrist or a fingertip is dragged to the hand's joints."""
+"""Joint positions of the hand for a dragged wrist or fingertip."""
 
 from __future__ import annotations
 
 import mujoco
 import numpy as np
-import torch
 
-from pgdm import rotations
-from pgdm.pregrasp.labeler import names
+from pgdm.pregrasp.hand_geometry import base_joints
+from pgdm.pregrasp.labeler import joint_names as names
 from pgdm.sim.scene import Scene
 
 TIP_TOLERANCE_M = 1e-4
-"""A fingertip this near to its target has reached it."""
+"""A fingertip closer to its target than this has reached it."""
 _ITERATIONS = 40
 _STEP_M = 0.02  # longest step of a fingertip towards its target: the Jacobian is only local
-_DAMPING_M = 0.004  # of the least squares: how far from singular poses it acts
-_BEYOND_WEIGHT = 1e6  # of an angle beyond its limits, against its distance from the one before
-_PULL = 0.1  # share of the way back to the pose before, where the fingertip leaves a choice
+_DAMPING_M = 0.004  # of the least squares, lambda below
+_BEYOND_WEIGHT = 1e6  # cost of an angle beyond its limits, against its distance from the last one
+_PULL = 0.1  # share of the change back to rest, within the null space of the fingertip
 
 
 class Kinematics:
-    """Forward and inverse kinematics of a scene's hand; keeps its joints within their limits.
+    """Forward and inverse kinematics of a scene's hand, within the joints' limits.
 
     Args:
-        scene: its actuated joints are the hand's, first in qpos; base joints are three slides,
+        scene: its hand's joints are first in qpos; base joints are three slides,
             then three hinges, X-Y-Z, on one body.
     """
 
@@ -31,13 +30,14 @@ class Kinematics:
         self._scene, self._model = scene, scene.model
         self.data = mujoco.MjData(scene.model)
         self.fingers = names.fingers(scene)
-        self.low, self.high = scene.model.jnt_range[: scene.model.nu].T.copy()
+        self.low, self.high = scene.model.jnt_range[: scene.index.num_joints].T.copy()
+        self._n, self._couplings = scene.index.num_joints, scene.index.couplings
         self._base = int(scene.model.jnt_bodyid[0])
         self._wrist = int(scene.index.point_bodies[0])
         self._jacobian = np.zeros((3, scene.model.nv))
 
     def forward(self, qpos: np.ndarray) -> mujoco.MjData:
-        """Return the scene's kinematics at qpos (nq,); the next call writes over it."""
+        """Return the scene's kinematics at qpos (nq,); the next call overwrites them."""
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self.data)
         mujoco.mj_comPos(self._model, self.data)
@@ -53,39 +53,33 @@ class Kinematics:
         return self.forward(qpos).xpos[self.fingers[finger].tip_body].copy()
 
     def place_wrist(self, qpos: np.ndarray, pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
-        """Return joints (nu,) that bring the wrist to a pose as near as the base's limits allow.
+        """Return joints (n,) that bring the wrist to a pose as near as the base's limits allow.
 
-        The inverse of :meth:`wrist_pose`: in the mount's frame the base's position gives the three
-        slides, and its orientation, as intrinsic X-Y-Z Euler angles, the three hinges. Of the
-        angles that mean the same orientation those within the limits are taken, then the nearest.
+        The inverse of :meth:`wrist_pose`. Of the hinge angles with that orientation, those within
+        the limits are preferred, then those nearest to the last pose.
 
         Args:
-            qpos: the pose before, (nq,).
-            pos: of the wrist, (3,) m, world frame.
-            quat: of the mount's body, (4,) wxyz.
+            qpos: the last pose (nq,).
+            pos: position of the wrist, (3,) m, world frame.
+            quat: quaternion of the mount's body, (4,) wxyz.
         """
-        index = self._scene.index
-        wrist, now = self.wrist_pose(qpos)
-        arm = np.empty(3)  # from the base's origin to the wrist, in the base's frame
-        mujoco.mju_rotVecQuat(arm, wrist - self.data.xpos[self._base], _inverse(now))
-        turned = np.empty(3)
-        unit = np.asarray(quat, float) / np.linalg.norm(quat)
-        mujoco.mju_rotVecQuat(turned, arm, unit)
-        to_mount, slides, in_mount = _inverse(index.mount_quat), np.empty(3), np.empty(4)
-        mujoco.mju_rotVecQuat(slides, np.asarray(pos, float) - turned - index.mount_pos, to_mount)
-        mujoco.mju_mulQuat(in_mount, to_mount, unit)
-        joints = qpos[: self._model.nu].copy()
+        data, flat = self.forward(qpos), np.empty(9)
+        base = data.xmat[self._base].reshape(3, 3)
+        arm = base.T @ (data.xpos[self._wrist] - data.xpos[self._base])  # base to wrist
+        mujoco.mju_quat2Mat(flat, np.asarray(quat, float) / np.linalg.norm(quat))
+        rotation = flat.reshape(3, 3)
+        slides, hinges = base_joints(self._scene, np.asarray(pos) - rotation @ arm, rotation)
+        joints = qpos[: self._n].copy()
         joints[:3] = slides
-        joints[3:6] = self._hinges(in_mount, qpos[3:6])
+        joints[3:6] = self._nearest(hinges, qpos[3:6])
         return joints.clip(self.low, self.high)
 
-    def _hinges(self, quat: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """Return hinge angles (3,) rad of an orientation (4,), as near as possible to others."""
-        x, y, z = rotations.to_euler_xyz(torch.from_numpy(quat)).numpy()
+    def _nearest(self, hinges: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Return, of triples of angles (2, 3) rad plus full turns, the one nearest to another."""
         low, high = self.low[3:6], self.high[3:6]
         found = []
-        for angles in (np.array([x, y, z]), np.array([x + np.pi, np.pi - y, z + np.pi])):
-            turns = angles + 2 * np.pi * np.arange(-2, 3)[:, None]  # (turns, 3), all the same
+        for angles in hinges:
+            turns = angles + 2 * np.pi * np.arange(-2, 3)[:, None]  # (turns, 3)
             beyond = np.abs(turns - turns.clip(low, high))
             costs = _BEYOND_WEIGHT * beyond + np.abs(turns - near)
             best = costs.argmin(axis=0)
@@ -96,52 +90,54 @@ class Kinematics:
     def reach_tip(
         self, qpos: np.ndarray, finger: int, target: np.ndarray, rest: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Return joints (nu,) whose fingertip is as near to a target as its finger goes.
+        """Return joints (n,) that bring a fingertip as near to a target as its finger can.
 
-        Damped least squares on the fingertip's Jacobian. A joint at its limit is left out for a
-        step that would go beyond; where the fingertip leaves a choice, joints go back to rest.
+        Damped least squares with the fingertip's Jacobian J, for a step e towards the target and a
+        pull p towards rest in J's null space:
+
+            dq = J# e + (I - J# J) p        J# = J^T (J J^T + lambda^2 I)^-1
+
+        Joints that would exceed their limits are left out of a step.
 
         Args:
-            qpos: the pose before, (nq,).
-            finger: which of the fingers; only its own joints move.
-            target: of the fingertip, (3,) m, world frame.
-            rest: joints (nu,) that the finger keeps to if it can.
+            qpos: the last pose (nq,).
+            finger: number of the finger; only its joints move.
+            target: target of the fingertip, (3,) m, world frame.
+            rest: joints (n,) to stay near.
 
         Returns:
-            The joints, and how far the fingertip is from the target, m.
+            The joints, and the fingertip's distance from the target, m.
         """
         one = self.fingers[finger]
-        ids = np.array(one.joints)
+        ids = np.setdiff1d(one.joints, self._couplings.followers)
         low, high = self.low[ids], self.high[ids]
         qpos = qpos.copy()
-        best, least = qpos[: self._model.nu].copy(), np.inf
+        best, least = qpos[: self._n].copy(), np.inf
         for _ in range(_ITERATIONS):
             error = target - self.tip(qpos, finger)
             distance = float(np.linalg.norm(error))
             if distance < least:
-                best, least = qpos[: self._model.nu].copy(), distance
+                best, least = qpos[: self._n].copy(), distance
             if distance < TIP_TOLERANCE_M:
                 break
             step = error * min(1.0, _STEP_M / distance)
             mujoco.mj_jacBody(self._model, self.data, self._jacobian, None, one.tip_body)
-            change = _damped(self._jacobian[:, ids], step, rest[ids] - qpos[ids])
+            jacobian = self._couplings.folded(self._jacobian, qpos)
+            change = _damped(jacobian[:, ids], step, rest[ids] - qpos[ids])
             stuck = ((qpos[ids] <= low) & (change < 0)) | ((qpos[ids] >= high) & (change > 0))
             if stuck.any():
                 free = ~stuck
                 change[stuck] = 0.0
                 pull = (rest[ids] - qpos[ids])[free]
-                change[free] = _damped(self._jacobian[:, ids[free]], step, pull)
+                change[free] = _damped(jacobian[:, ids[free]], step, pull)
             qpos[ids] = (qpos[ids] + change).clip(low, high)
+            self._couplings.apply(qpos)
         return best, least
 
 
 def _damped(jacobian: np.ndarray, step: np.ndarray, pull: np.ndarray) -> np.ndarray:
-    """Return the least change of joints (J,) for a step (3,); a pull (J,) where it is free."""
+    """Return the change of qpos (J,) for a step (3,), with a pull (J,) in the null space."""
     square = jacobian @ jacobian.T + _DAMPING_M**2 * np.eye(3)
     inverse = jacobian.T @ np.linalg.inv(square)
     back = _PULL * pull
     return inverse @ step + back - inverse @ (jacobian @ back)
-
-
-def _inverse(quat: np.ndarray) -> np.ndarray:
-    return quat * np.array([1.0, -1.0, -1.0, -1.0])

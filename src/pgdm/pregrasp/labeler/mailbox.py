@@ -1,4 +1,4 @@
-"""One thread that does what all pages ask for, one after the other."""
+"""One thread that runs the actions of all pages, one after the other."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Action = Callable[[], None]
 
 
 class Mailbox:
-    """Actions from any thread, done in their order by one.
+    """Actions posted by any thread, run in order by one.
 
-    Of actions with one key that wait directly behind each other only the last is done: a page
-    that drags faster than a machine computes is followed, not queued up.
+    Of consecutive waiting actions with the same key only the last runs, so that a drag faster than
+    the machine computes does not queue up.
 
     Args:
-        complain: told why an action failed.
+        complain: receives the message if an action fails.
     """
 
     def __init__(self, complain: Callable[[str], None]) -> None:
@@ -29,13 +29,11 @@ class Mailbox:
         self._waiting: deque[tuple[Hashable, Action]] = deque()
         self._condition = threading.Condition()
         self._busy = self._ended = False
-        self.done = 0
-        """Actions that were done."""
         self._thread = threading.Thread(target=self._run, name="labeler", daemon=True)
         self._thread.start()
 
     def post(self, action: Action, key: Hashable = None) -> None:
-        """Have an action done; with a key, it takes the place of one that waits as the last."""
+        """Queue an action; it replaces the last one waiting if that has the same key."""
         with self._condition:
             if key is not None and self._waiting and self._waiting[-1][0] == key:
                 self._waiting.pop()
@@ -43,12 +41,12 @@ class Mailbox:
             self._condition.notify_all()
 
     def wait(self, timeout_s: float = 60.0) -> bool:
-        """Wait until nothing is left to do; return whether that happened in time."""
+        """Wait until all actions have run; return false on timeout."""
         with self._condition:
             return self._condition.wait_for(lambda: not self._waiting and not self._busy, timeout_s)
 
     def close(self) -> None:
-        """Do what waits, and end."""
+        """Run the waiting actions, and stop."""
         with self._condition:
             self._ended = True
             self._condition.notify_all()
@@ -68,10 +66,9 @@ class Mailbox:
                 self._complain(str(error))
             except OSError as error:
                 self._complain(f"{error.filename or ''} {error.strerror or error}".strip())
-            except Exception as error:  # noqa: BLE001 a defect must not end the page with its pose
-                _log.exception("the labeler could not do what a page asked for")
-                self._complain(f"a defect of pgdm: {type(error).__name__}: {error}")
+            except Exception as error:  # noqa: BLE001 a bug must not take the page and its pose down
+                _log.exception("an action of the labeler failed")
+                self._complain(f"bug in pgdm: {type(error).__name__}: {error}")
             with self._condition:
                 self._busy = False
-                self.done += 1
                 self._condition.notify_all()

@@ -1,4 +1,4 @@
-"""The labeler in the browser: pages talk to one state, which one thread changes."""
+"""The labeler in the browser: all pages share one state, which one thread changes."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pgdm.library import pregrasp_file
-from pgdm.pregrasp.labeler import guard, store
+from pgdm.errors import ConfigError
+from pgdm.library.files import pregrasp as pregrasp_file
+from pgdm.pregrasp.labeler import guard
+from pgdm.pregrasp.labeler import poses as store
 from pgdm.pregrasp.labeler.mailbox import Mailbox
-from pgdm.pregrasp.labeler.panel import Commands, Panel
+from pgdm.pregrasp.labeler.panel import GREEN, Commands, Panel
+from pgdm.pregrasp.labeler.poses import Draft, Loaded, Poses
 from pgdm.pregrasp.labeler.shapes import Shape
 from pgdm.pregrasp.labeler.stage import Stage
 from pgdm.pregrasp.labeler.state import LabelState
-from pgdm.pregrasp.labeler.store import Draft, Loaded, Poses
 from pgdm.pregrasp.labeler.trial import Outcome, Trial
 from pgdm.sim.scene import Scene
 
@@ -23,12 +25,12 @@ class LabelPage:
 
     Args:
         scene: the task's, with the hand.
-        poses: that can be taken.
-        start: the pose to begin with.
-        draft: where the pose is kept while it is made.
-        shapes: what is seen of the scene, and what contacts are computed with.
+        poses: that can be loaded.
+        start: the first pose.
+        draft: keeps the unsaved pose.
+        shapes: visible shapes and collision shapes.
         substeps: physics steps per control step.
-        port: to listen at, on this machine only; the next free one if it is taken.
+        port: port to listen at, on this machine only; the next free one if it is taken.
     """
 
     def __init__(
@@ -43,10 +45,12 @@ class LabelPage:
     ) -> None:
         self.state = LabelState(scene, start.qpos)
         self._scene, self._poses, self._draft, self._substeps = scene, poses, draft, substeps
-        self._dragged: object = None
+        self.dragged: object = None
+        """The handle being dragged: ``wrist`` or the number of a finger; None if there is none."""
         self._drags = 0
+        self._saved = False  # whether the stored pose is of this page
         self._trial: Trial | None = None
-        self._outcome: tuple[int, Outcome] | None = None  # with the state's version it is of
+        self._outcome: tuple[int, Outcome] | None = None  # with the version of the state tried
         self.mailbox = Mailbox(lambda text: self.panel.complain(text))
         self.server = guard.open_server(port)
         self.stage = Stage(self.server, scene, self.state.kinematics, *shapes)
@@ -58,7 +62,7 @@ class LabelPage:
 
     @property
     def url(self) -> str:
-        """Address of the page."""
+        """URL of the page."""
         return f"http://{guard.HOST}:{self.server.get_port()}"
 
     @property
@@ -67,13 +71,12 @@ class LabelPage:
         return self._trial is None
 
     def save(self, anyway: bool = False) -> None:
-        """Have the pose saved, also one that touches something if it shall be so."""
+        """Save the pose; one that touches something only with ``anyway``."""
         self.mailbox.post(lambda: self._save(anyway))
 
     def close(self) -> None:
-        """End the server; the pose that is not saved stays as a draft."""
-        if self._trial is not None:
-            self._trial.cancel()
+        """Stop the server; an unsaved pose stays as a draft."""
+        self._cancel()
         guard.close_server(self.server)
         self.mailbox.close()
 
@@ -84,10 +87,10 @@ class LabelPage:
         state = self.state
         return Commands(
             set_joint=self.set_joint,
-            preset=lambda name: self.mailbox.post(lambda: self._take(name)),
-            undo=later(lambda: self._went(state.undo, "undone", "nothing to undo")),
-            redo=later(lambda: self._went(state.redo, "done again", "nothing to do again")),
-            reset=later(lambda: self._went(state.reset, "back at the first pose", "")),
+            preset=lambda name: self.mailbox.post(lambda: self._load(name)),
+            undo=later(lambda: self._step(state.undo, "undone", "nothing to undo")),
+            redo=later(lambda: self._step(state.redo, "redone", "nothing to redo")),
+            reset=later(lambda: self._step(state.reset, "back at the start pose", "")),
             try_it=later(self._try_it),
             cancel=later(self._cancel),
             save=self.save,
@@ -96,7 +99,7 @@ class LabelPage:
         )
 
     def set_joint(self, joint: int, value: float, gesture: object) -> None:
-        """Have a joint set, m or rad, as by a slider."""
+        """Set a joint, m or rad, as a slider does."""
 
         def action() -> None:
             self._change(lambda: self.state.set_joint(joint, value, gesture), joint)
@@ -104,31 +107,31 @@ class LabelPage:
         self.mailbox.post(action, gesture)
 
     def drag_wrist(self, pos: np.ndarray, quat: np.ndarray, phase: str) -> None:
-        """Have the wrist follow its handle: (3,) m, (4,) wxyz, and start, update or end."""
+        """Move the wrist with its handle: (3,) m, (4,) wxyz; phase start, update or end."""
         self._drag("wrist", phase, lambda g: self.state.place_wrist(pos, quat, g))
 
     def drag_tip(self, finger: int, pos: np.ndarray, phase: str) -> None:
-        """Have a fingertip follow its handle: (3,) m, and start, update or end."""
+        """Move a fingertip with its handle: (3,) m; phase start, update or end."""
         self._drag(finger, phase, lambda g: self.state.place_tip(finger, pos, g))
 
     def _drag(self, handle: object, phase: str, move: Callable[[object], object]) -> None:
-        """Follow a drag; grabbing a handle moves nothing yet, letting go puts it on the hand."""
+        """Follow a drag: grabbing a handle moves nothing, releasing it puts it back on the hand."""
         self._drags += phase == "start"
         gesture = "drag", handle, self._drags
 
         def action() -> None:
-            self._dragged = None if phase == "end" else handle
+            self.dragged = None if phase == "end" else handle
             self._change((lambda: None) if phase == "start" else lambda: move(gesture))
 
         self.mailbox.post(action, gesture if phase == "update" else None)
 
-    def _take(self, name: str) -> None:
-        loaded = self._poses.load(name, self.state.qpos[: self._scene.model.nu])
-        nu = self._scene.model.nu
-        self._change(lambda: self.state.set_joints(loaded.qpos[:nu]))
-        self.panel.say(". ".join((f"took the {loaded.origin}", *loaded.notes)))
+    def _load(self, name: str) -> None:
+        loaded = self._poses.load(name, self.state.qpos[: self._scene.index.num_joints])
+        n = self._scene.index.num_joints
+        self._change(lambda: self.state.set_joints(loaded.qpos[:n]))
+        self.panel.say(". ".join((f"loaded the {loaded.origin}", *loaded.notes)))
 
-    def _went(self, change: Callable[[], object], done: str, nothing: str) -> None:
+    def _step(self, change: Callable[[], object], done: str, nothing: str) -> None:
         before = self.state.version
         self._change(change)
         self.panel.say(done if self.state.version != before else nothing or done)
@@ -147,42 +150,46 @@ class LabelPage:
         qpos = self.state.qpos
         with self.server.atomic():
             self.stage.pose(qpos)
-            self.stage.handles(qpos, self._dragged)
-            self.stage.warn(self.state.figures)
-            self.panel.show(self.state.figures, slider)
+            self.stage.handles(qpos, self.dragged)
+            self.stage.warn(self.state.metrics)
+            self.panel.show(self.state.metrics, slider)
         if self._draft.error is not None:
-            self.panel.complain(f"the draft is not kept: {self._draft.error.strerror}")
+            self.panel.complain(f"the draft cannot be written: {self._draft.error.strerror}")
 
     def _save(self, anyway: bool) -> None:
-        figures = self.state.figures
-        outcome = self._outcome
-        fresh = outcome is not None and outcome[0] == self.state.version
-        reached = outcome[1].reached if outcome is not None and fresh else None
-        extra = outcome[1].note if outcome is not None and fresh else {}
-        self.panel.offer_anyway(not figures.free and not anyway)
-        made = store.pregrasp(self.state, reached, anyway, extra)
+        outcome = Outcome(None, {})
+        if self._outcome is not None and self._outcome[0] == self.state.version:
+            outcome = self._outcome[1]
         path = store.path(self._scene)
-        pregrasp_file.write(path, made)
+        earlier = path.exists() and not self._saved
+        self.panel.offer_anyway((earlier or not self.state.metrics.free) and not anyway)
+        if earlier and not anyway:
+            raise ConfigError(
+                f"not saved: {path} holds a pose of an earlier time; 'Save anyway' replaces it"
+            )
+        pregrasp_file.write(path, store.pregrasp(self.state, outcome.reached, anyway, outcome.note))
+        self._saved = True
         self._draft.drop()
-        way = "with the way there" if reached is not None else "as a pose"
-        said = f"saved {way}: {path}. Use it: pgdm-run task={self._scene.task.id} pregrasp=labeled"
-        self.panel.say(said, "#2f9e44")
+        what = "pose" if outcome.reached is None else "pose and reach"
+        task, hand = self._scene.task.id, self._scene.hand.name
+        use = f"pgdm-run task={task} hand={hand} pregrasp=labeled"
+        self.panel.say(f"saved {what}: {path}. To use it: {use}", GREEN)
 
     def _try_it(self) -> None:
         if self._trial is not None:
             return
         version = self.state.version
 
-        def told(share: float, text: str) -> None:
+        def on_progress(share: float, text: str) -> None:
             self.mailbox.post(lambda: self.panel.progress(share, text), "progress")
 
-        def played(qpos: np.ndarray) -> bool:
+        def on_state(qpos: np.ndarray) -> bool:
             if self.state.version != version:
                 return False
             self.mailbox.post(lambda: self.stage.pose(qpos), "play")
             return True
 
-        def ended(outcome: Outcome | None, text: str) -> None:
+        def on_end(outcome: Outcome | None, text: str) -> None:
             def action() -> None:
                 self._trial = None
                 self._outcome = None if outcome is None else (version, outcome)
@@ -191,7 +198,9 @@ class LabelPage:
 
             self.mailbox.post(action)
 
-        self._trial = Trial(self._scene, self.state.qpos, self._substeps, told, played, ended)
+        self._trial = Trial(
+            self._scene, self.state.qpos, self._substeps, on_progress, on_state, on_end
+        )
 
     def _cancel(self) -> None:
         if self._trial is not None:

@@ -1,34 +1,35 @@
-"""The controls beside the scene, and what they tell."""
+"""The controls next to the scene, and the messages above them."""
 
 from __future__ import annotations
 
 import html
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import viser
 
-from pgdm.pregrasp.labeler.figures import Figures
-from pgdm.pregrasp.labeler.names import WRIST, Joint
+from pgdm.pregrasp.labeler.joint_names import WRIST, Joint
+from pgdm.pregrasp.labeler.measures import Metrics
 from pgdm.pregrasp.labeler.state import LabelState
 from pgdm.sim.contact import FAR_M
 
 PAUSE_S = 1.0
-"""A slider that rests for so long begins a new step of the history."""
+"""A slider that rests this long starts a new step of the history."""
 _ORDER = (WRIST, "Index", "Middle", "Ring", "Little", "Thumb")
 _STEP = 0.1  # of the sliders, mm and degrees
-_GREEN, _RED, _AMBER = "#2f9e44", "#e03131", "#e8890c"
+GREEN, _RED, _AMBER = "#2f9e44", "#e03131", "#e8890c"
 HANDLES = ("all", "wrist", "fingertips", "none")
 
 
 @dataclass(frozen=True)
 class Commands:
-    """What the controls do; each is called in the order of the clicks."""
+    """Functions behind the controls, called in the order of the clicks."""
 
     set_joint: Callable[[int, float, object], None]
-    """Told joint, value in m or rad, and gesture."""
+    """Called with joint, value in m or rad, and gesture."""
     preset: Callable[[str], None]
     undo: Callable[[], None]
     redo: Callable[[], None]
@@ -36,7 +37,7 @@ class Commands:
     try_it: Callable[[], None]
     cancel: Callable[[], None]
     save: Callable[[bool], None]
-    """Told whether to save although the hand touches something."""
+    """Called with whether to save even if the hand touches something."""
     handles: Callable[[str], None]
     solid: Callable[[bool], None]
 
@@ -45,10 +46,10 @@ class Panel:
     """The controls of all pages.
 
     Args:
-        server: whose controls they are.
-        state: the pose that they show.
-        presets: names of the poses that can be taken.
-        commands: what they do.
+        server: server of the pages.
+        state: the pose shown.
+        presets: names of the poses that can be loaded.
+        commands: what the controls do.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class Panel:
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(18, 128, 122))
         gui.main_panel.dock_right()
         self._head = gui.add_html("")
-        self._figures = gui.add_html("")
+        self._metrics = gui.add_html("")
         self._history()
         self._presets(presets)
         self._trial()
@@ -78,32 +79,32 @@ class Panel:
                     self._slider(joint)
 
     def say(self, text: str, color: str = "") -> None:
-        """Show a sentence above the figures, until the next one."""
+        """Show a message above the metrics, until the next one."""
         scene = self._state.scene
         title = f"<b>{html.escape(scene.task.id)}</b>, hand {html.escape(scene.hand.name)}"
         line = f'<div style="color:{color or "inherit"};min-height:1.4em">{html.escape(text)}</div>'
         self._head.content = _block(f"<div>{title}</div>{line}")
 
     def complain(self, text: str) -> None:
-        """Show what went wrong."""
+        """Show an error."""
         self.say(text, _RED)
 
-    def show(self, figures: Figures, moved_by: int | None) -> None:
-        """Show the pose and its figures; leave the slider alone that is being moved."""
+    def show(self, metrics: Metrics, moved_by: int | None) -> None:
+        """Show the pose and its metrics; the slider being moved stays as it is."""
         qpos = self._state.qpos
         for joint in self._state.joints:
             slider = self._sliders[joint.index]
             shown = round(float(qpos[joint.index]) * joint.scale, 2)
             if joint.index != moved_by and slider.value != shown:
                 slider.value = shown
-        self._figures.content = _block(_figures(figures, self._state))
+        self._metrics.content = _block(_as_html(metrics, self._state))
 
     def offer_anyway(self, offered: bool) -> None:
-        """Show the button that saves although the hand touches something, or hide it."""
+        """Show or hide the button that saves even if the hand touches something."""
         self._anyway.visible = offered
 
     def progress(self, share: float | None, text: str) -> None:
-        """Show how far the trial is (0..1) and what it found; None where nothing runs."""
+        """Show the trial's progress (0..1), None if none runs, and its description."""
         running = share is not None
         self._try.disabled, self._cancel.visible = running, running
         self._bar.visible = running
@@ -115,67 +116,45 @@ class Panel:
         gui, do = self._gui, self._do
         actions = {"Undo": do.undo, "Redo": do.redo, "Start pose": do.reset}
         group = gui.add_button_group("History", tuple(actions), hint="Ctrl-Z, Ctrl-Shift-Z")
-
-        async def clicked(event: viser.GuiEvent) -> None:
-            actions[str(event.target.value)]()
-
-        group.on_click(clicked)
+        group.on_click(_handler(lambda event: actions[event.target.value]()))
         undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
+        undo.on_trigger(_handler(lambda _: do.undo()))
         redo = gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
-        for command, action in ((undo, do.undo), (redo, do.redo)):
-
-            async def triggered(
-                event: viser.CommandEvent, action: Callable[[], None] = action
-            ) -> None:
-                del event
-                action()
-
-            command.on_trigger(triggered)
+        redo.on_trigger(_handler(lambda _: do.redo()))
 
     def _presets(self, presets: Sequence[str]) -> None:
         group = self._gui.add_button_group("Pose from", tuple(presets))
-
-        async def clicked(event: viser.GuiEvent) -> None:
-            self._do.preset(str(event.target.value))
-
-        group.on_click(clicked)
+        group.on_click(_handler(lambda event: self._do.preset(event.target.value)))
 
     def _trial(self) -> None:
         gui = self._gui
         self._try = gui.add_button(
-            "Try it", icon=viser.Icon.PLAYER_PLAY, hint="Plan the way there, then grasp and lift"
+            "Try it", icon=viser.Icon.PLAYER_PLAY, hint="Plan the reach, then grasp and lift"
         )
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.PLAYER_STOP, visible=False)
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._result = gui.add_html("")
-        _on_click(self._try, self._do.try_it)
-        _on_click(self._cancel, self._do.cancel)
+        self._try.on_click(_handler(lambda _: self._do.try_it()))
+        self._cancel.on_click(_handler(lambda _: self._do.cancel()))
 
     def _saving(self) -> None:
         gui = self._gui
         save = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY, color="teal")
         self._anyway = gui.add_button("Save anyway", color="red", visible=False)
-        _on_click(save, lambda: self._do.save(False))
-        _on_click(self._anyway, lambda: self._do.save(True))
+        save.on_click(_handler(lambda _: self._do.save(False)))
+        self._anyway.on_click(_handler(lambda _: self._do.save(True)))
 
     def _view(self) -> None:
         handles = self._gui.add_button_group("Handles", HANDLES)
         solid = self._gui.add_checkbox(
-            "Contact shapes", False, hint="What contacts are computed with"
+            "Contact shapes", False, hint="Geometry that contacts are computed with"
         )
-
-        async def chosen(event: viser.GuiEvent) -> None:
-            self._do.handles(str(event.target.value))
-
-        async def checked(event: viser.GuiEvent) -> None:
-            self._do.solid(bool(event.target.value))
-
-        handles.on_click(chosen)
-        solid.on_update(checked)
+        handles.on_click(_handler(lambda event: self._do.handles(event.target.value)))
+        solid.on_update(_handler(lambda event: self._do.solid(event.target.value)))
 
     def _slider(self, joint: Joint) -> None:
         kinematics = self._state.kinematics
-        # Rounded inwards, so that no value is refused.
+        # Rounded inwards, so that no value exceeds the limits.
         low = float(np.ceil(kinematics.low[joint.index] * joint.scale * 100) / 100)
         high = float(np.floor(kinematics.high[joint.index] * joint.scale * 100) / 100)
         value = round(float(self._state.qpos[joint.index]) * joint.scale, 2)
@@ -197,7 +176,7 @@ class Panel:
         slider.on_update(moved)
 
     def _gesture_of(self, joint: int) -> object:
-        """Return what movement of a slider this is; after a pause it is a new one."""
+        """Return the gesture of a slider's movement; after a pause it is a new one."""
         before, when, number = self._gesture
         now = time.monotonic()
         number += before != joint or now - when > PAUSE_S
@@ -209,12 +188,13 @@ def _rank(group: str) -> tuple[int, str]:
     return (_ORDER.index(group) if group in _ORDER else len(_ORDER), group)
 
 
-def _on_click(button: viser.GuiButtonHandle, action: Callable[[], None]) -> None:
-    async def clicked(event: viser.GuiEvent) -> None:
-        del event
-        action()
+def _handler(action: Callable[[Any], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
+    """Return a listener for viser; a coroutine, so that events are handled in their order."""
 
-    button.on_click(clicked)
+    async def handle(event: Any) -> None:
+        action(event)
+
+    return handle
 
 
 def _block(text: str) -> str:
@@ -226,23 +206,22 @@ def _dot(color: str, text: str) -> str:
     return f"<div>{dot} {html.escape(text)}</div>"
 
 
-def _figures(figures: Figures, state: LabelState) -> str:
-    """Return the figures of a pose as HTML."""
-    if figures.free:
-        lines = [_dot(_GREEN, "touches nothing")]
+def _as_html(metrics: Metrics, state: LabelState) -> str:
+    if metrics.free:
+        lines = [_dot(GREEN, "touches nothing")]
     else:
         lines = [
             _dot(_RED, f"{t.part} is {1e3 * t.depth_m:.1f} mm inside {t.body}")
-            for t in figures.touches[:4]
+            for t in metrics.touches[:4]
         ]
-        more = len(figures.touches) - 4
+        more = len(metrics.touches) - 4
         lines += [_dot(_RED, f"and {more} more")] if more > 0 else []
-    if figures.beyond:
-        lines.append(_dot(_AMBER, f"beyond the actuators: {', '.join(figures.beyond)}"))
+    if metrics.beyond:
+        lines.append(_dot(_AMBER, f"outside the actuators' range: {', '.join(metrics.beyond)}"))
     else:
-        lines.append(_dot(_GREEN, "within the actuators' range; Try it tells more"))
+        lines.append(_dot(GREEN, "within the actuators' range ('Try it' checks the reach)"))
     cells = sorted(
-        zip((f.name for f in state.kinematics.fingers), figures.tip_distances_m, strict=True),
+        zip((f.name for f in state.kinematics.fingers), metrics.tip_distances_m, strict=True),
         key=lambda cell: _rank(cell[0].capitalize()),
     )
     names = "".join(f'<td style="padding-right:0.9em">{html.escape(n)}</td>' for n, _ in cells)

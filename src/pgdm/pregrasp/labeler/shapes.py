@@ -1,4 +1,4 @@
-"""What a scene looks like: the visible geoms of each body as triangles."""
+"""Triangles of a scene's bodies, for display: visible geoms and collision geoms."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ import mujoco
 import numpy as np
 import trimesh
 
+from pgdm.pregrasp.primitives import primitive
 from pgdm.sim.scene import Scene
 
 OBJECT_RGB = np.array([0.29, 0.55, 0.66])
-"""Of the tracked object: the released scenes paint it like the hand."""
+"""Colour of the tracked object, which the released scenes paint like the hand."""
 TABLE_RGB = np.array([0.52, 0.50, 0.47])
 SOLID_RGB = np.array([0.55, 0.62, 0.95])
-"""Of the shapes that contacts are computed with."""
-_DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # MuJoCo's word for: take the material's
+"""Colour of collision geoms."""
+_DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # in MuJoCo: use the material's
 _LAST_GROUP = 2  # MuJoCo's viewers show the first three groups of geoms
-_CREASE_RAD = 0.6  # edges sharper than this stay edges
-_MAX_FACES = 3000  # of a mesh: the servos' screw threads are not what a browser should draw
+_CREASE_RAD = 0.6  # edges sharper than this are not smoothed
+_MAX_FACES = 3000  # of a mesh: servos are modelled down to their screw threads
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Shape:
 
 
 def visible(scene: Scene) -> list[Shape]:
-    """Return what is seen of table, hand and objects; the floor and the skyline are left out."""
+    """Return the visible shapes of table, hand and objects, without floor and background."""
     model = scene.model
     drawn: dict[tuple[int, tuple[int, int, int]], list[trimesh.Trimesh]] = {}
     meshes: dict[int, trimesh.Trimesh] = {}
@@ -44,7 +45,7 @@ def visible(scene: Scene) -> list[Shape]:
 
 
 def solid(scene: Scene) -> list[Shape]:
-    """Return the shapes of hand and objects that contacts are computed with."""
+    """Return the collision shapes of hand and objects."""
     model = scene.model
     rgb = _bytes(SOLID_RGB)
     shapes, meshes = [], {}
@@ -65,11 +66,11 @@ def _collides(model: mujoco.MjModel, geom: int) -> bool:
 
 
 def _seen(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return a body's visible geoms; where it has a mesh to look at, not those it collides with."""
+    """Return a body's visible geoms: its visual ones if it has a visual mesh, else all."""
     shown = [g for g in _geoms(model, body) if model.geom_group[g] <= _LAST_GROUP]
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     looks = [g for g in shown if is_mesh[g] and not _collides(model, g)]
-    # The released files make some of these transparent; they are what the object looks like.
+    # Some visual meshes of the released files are transparent, but there is nothing else to show.
     if looks:
         solid_too = [g for g in shown if not is_mesh[g] and not _collides(model, g)]
         return looks + [g for g in solid_too if _alpha(model, g) > 0]
@@ -99,39 +100,24 @@ def _bytes(rgb: np.ndarray) -> tuple[int, int, int]:
 
 
 def _shape(body: int, rgb: tuple[int, int, int], parts: list[trimesh.Trimesh]) -> Shape:
-    vertices, faces, count = [], [], 0
-    for part in parts:
-        vertices.append(np.asarray(part.vertices))
-        faces.append(np.asarray(part.faces) + count)
-        count += len(part.vertices)
-    return Shape(body, np.concatenate(vertices), np.concatenate(faces), rgb)
+    whole = trimesh.util.append_faces([p.vertices for p in parts], [p.faces for p in parts])
+    return Shape(body, *whole, rgb)
 
 
 def _triangles(
     model: mujoco.MjModel, geom: int, meshes: dict[int, trimesh.Trimesh]
 ) -> trimesh.Trimesh:
-    """Return a geom's surface in its body's frame, its creases sharp; remembers meshes."""
-    kind, size = int(model.geom_type[geom]), model.geom_size[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+    """Return a geom's surface in its body's frame, smooth except for creases; caches meshes."""
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         data = int(model.geom_dataid[geom])
         if data not in meshes:
             meshes[data] = trimesh.graph.smooth_shade(_mesh(model, data), angle=_CREASE_RAD)
         mesh = meshes[data].copy()
-    elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-        mesh = trimesh.creation.box(extents=2 * size)
-    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        mesh = trimesh.creation.cylinder(radius=size[0], height=2 * size[1])
-    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        mesh = trimesh.creation.capsule(radius=size[0], height=2 * size[1])
-        mesh.vertices -= mesh.bounds.mean(axis=0)
     else:
-        mesh = trimesh.creation.icosphere(subdivisions=3)
-        mesh.vertices *= size if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0]
-    if kind != mujoco.mjtGeom.mjGEOM_MESH:
-        mesh = trimesh.graph.smooth_shade(mesh, angle=_CREASE_RAD)
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-    mesh.vertices = np.asarray(mesh.vertices) @ turn.reshape(3, 3).T + model.geom_pos[geom]
+        mesh = trimesh.graph.smooth_shade(primitive(model, geom), angle=_CREASE_RAD)
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+    mesh.vertices = np.asarray(mesh.vertices) @ rotation.reshape(3, 3).T + model.geom_pos[geom]
     return mesh
 
 
@@ -140,6 +126,6 @@ def _mesh(model: mujoco.MjModel, mesh: int) -> trimesh.Trimesh:
     face, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
     vertices, corners = model.mesh_vert[first : first + count], model.mesh_face[face : face + faces]
     found = trimesh.Trimesh(vertices, corners)
-    return (
-        found if faces <= _MAX_FACES else found.simplify_quadric_decimation(face_count=_MAX_FACES)
-    )
+    if faces <= _MAX_FACES:
+        return found
+    return found.simplify_quadric_decimation(face_count=_MAX_FACES)

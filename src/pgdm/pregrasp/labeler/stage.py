@@ -1,48 +1,41 @@
-"""The scene in the page: bodies that move, colours that warn, handles to drag."""
+"""The scene on the page: moving bodies, warning colours, handles to drag."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import viser
 
-from pgdm.pregrasp.labeler.figures import Figures
 from pgdm.pregrasp.labeler.kinematics import Kinematics
+from pgdm.pregrasp.labeler.measures import Metrics
 from pgdm.pregrasp.labeler.shapes import Shape
 from pgdm.sim.camera import camera_for
 from pgdm.sim.scene import Scene
 
 INSIDE_RGB = (222, 45, 38)
-"""Of links that cut into something."""
-_STILL = 1e-7  # m, and of a quaternion's parts: bodies that moved less are not sent again
+"""Colour of links that penetrate something."""
+_STILL = 1e-7  # change of position (m) or quaternion below which a body is not sent again
 _ASPECT = 1.2  # of the part of the page that shows the scene
-_NEARER = 0.85  # than a film's camera: the forearm need not be seen
-_WRIST_SCALE, _TIP_SCALE = 0.11, 0.04  # m, of the handles
+_NEARER = 0.85  # distance relative to a video's camera: the forearm need not be in view
+_WRIST_SCALE, _TIP_SCALE = 0.11, 0.04  # m, size of the handles
 
 OnWrist = Callable[[np.ndarray, np.ndarray, str], None]
-"""Told position (3,), orientation (4,) and phase (start, update, end) of the wrist's handle."""
+"""Called with position (3,), orientation (4,) and phase (start, update, end) of its handle."""
 OnTip = Callable[[int, np.ndarray, str], None]
-"""Told finger, position (3,) and phase of a fingertip's handle."""
-
-
-@dataclass
-class _Part:
-    mesh: viser.MeshHandle
-    rgb: tuple[int, int, int]
+"""Called with finger, position (3,) and phase of its handle."""
 
 
 class Stage:
     """Draws the scene, shared by all pages.
 
     Args:
-        server: whose scene it is.
-        scene: what to draw.
-        kinematics: of the scene.
-        looks: what is seen of it.
-        solid: the shapes that contacts are computed with.
+        server: server of the pages.
+        scene: scene to draw.
+        kinematics: kinematics of the scene.
+        looks: visible shapes.
+        solid: collision shapes.
     """
 
     def __init__(
@@ -55,14 +48,14 @@ class Stage:
     ) -> None:
         self._scene_api, self._scene, self._kinematics = server.scene, scene, kinematics
         self._frames: dict[int, viser.FrameHandle] = {}
-        self._parts: dict[int, list[_Part]] = {}
+        self._parts: dict[int, list[tuple[viser.MeshHandle, tuple[int, int, int]]]] = {}
         self._solid: list[viser.MeshHandle] = []
         self._inside: frozenset[int] = frozenset()
         self._lights()
         for number, shape in enumerate(looks):
             name = f"{self._frame(shape.body)}/{number}"
             mesh = self._mesh(name, shape, None)
-            self._parts.setdefault(shape.body, []).append(_Part(mesh, shape.rgb))
+            self._parts.setdefault(shape.body, []).append((mesh, shape.rgb))
         for shape in solid:
             mesh = self._mesh(f"{self._frame(shape.body)}/solid", shape, 0.45)
             mesh.visible = False
@@ -73,7 +66,7 @@ class Stage:
         self.tips = [self._tip(finger.name) for finger in kinematics.fingers]
 
     def on_drag(self, wrist: OnWrist, tip: OnTip) -> None:
-        """Have drags of the handles told, in their order."""
+        """Call functions when handles are dragged, in order."""
 
         async def wrist_moved(event: viser.TransformControlsEvent) -> None:
             handle = event.target
@@ -88,7 +81,7 @@ class Stage:
             handle.on_update(tip_moved)
 
     def aim(self, server: viser.ViserServer, qpos: np.ndarray) -> None:
-        """Have new pages look at hand and object, with nothing in between."""
+        """Set the first view of new pages: hand and object, unobstructed."""
         model, index = self._scene.model, self._scene.index
         data = self._kinematics.forward(qpos)
         hand = data.geom_xpos[index.point_geoms]
@@ -114,11 +107,11 @@ class Stage:
                 frame.wxyz = data.xquat[body]
 
     def handles(self, qpos: np.ndarray, dragged: object) -> None:
-        """Move the handles to where qpos (nq,) has what they move, but not the one in a hand.
+        """Move all handles to wrist and fingertips at qpos (nq,), except the one being dragged.
 
         Args:
             qpos: the pose.
-            dragged: ``wrist``, a finger's number, or None.
+            dragged: ``wrist``, the number of a finger, or None.
         """
         pos, quat = self._kinematics.wrist_pose(qpos)
         if dragged != "wrist":
@@ -128,12 +121,12 @@ class Stage:
             if finger != dragged:
                 _place(handle, data.xpos[self._kinematics.fingers[finger].tip_body], None)
 
-    def warn(self, figures: Figures) -> None:
-        """Colour the links that cut into something."""
-        for body in self._inside ^ figures.links:
-            for part in self._parts.get(self._drawn(body), []):
-                part.mesh.color = INSIDE_RGB if body in figures.links else part.rgb
-        self._inside = figures.links
+    def warn(self, metrics: Metrics) -> None:
+        """Colour the links that penetrate something."""
+        for body in self._inside ^ metrics.links:
+            for mesh, rgb in self._parts.get(self._drawn(body), []):
+                mesh.color = INSIDE_RGB if body in metrics.links else rgb
+        self._inside = metrics.links
 
     def show_handles(self, which: str) -> None:
         """Show handles: ``all``, ``wrist``, ``fingertips`` or ``none``."""
@@ -142,12 +135,12 @@ class Stage:
             handle.visible = which in ("all", "fingertips")
 
     def show_solid(self, shown: bool) -> None:
-        """Show the shapes that contacts are computed with, or not."""
+        """Show or hide the collision shapes."""
         for mesh in self._solid:
             mesh.visible = shown
 
     def _drawn(self, body: int) -> int:
-        """Return the nearest body towards the palm of which something is seen."""
+        """Return the nearest visible body from a body towards the palm."""
         while body not in self._parts and body:
             body = int(self._scene.model.body_parentid[body])
         return body
@@ -155,7 +148,7 @@ class Stage:
     def _lights(self) -> None:
         scene = self._scene_api
         scene.configure_environment_map("studio", environment_intensity=0.25)
-        # The page's shadows are made for rooms: a hand over a table casts none, but they cost.
+        # viser's shadows are for rooms: a hand over a table casts none, but they cost time.
         scene.configure_default_lights(cast_shadow=False)
         scene.world_axes.visible = False
 

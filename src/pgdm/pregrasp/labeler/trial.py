@@ -1,4 +1,4 @@
-"""Trying a pose: the hand is brought there in the simulation, and then grasps and lifts."""
+"""A trial of a pose in the simulation: reach it, then grasp and lift."""
 
 from __future__ import annotations
 
@@ -14,40 +14,43 @@ from typing import Any
 import numpy as np
 
 from pgdm.errors import PgdmError
-from pgdm.library.motion_file import Start
+from pgdm.library.files.motion import Start
 from pgdm.pregrasp.quality import LiftTest, quality
-from pgdm.pregrasp.reach import ReachPlan, plan_reach, play, reset_pose
+from pgdm.pregrasp.reach.plan import ReachPlan
+from pgdm.pregrasp.reach.planner import plan_reach
+from pgdm.pregrasp.reach.rollout import play
+from pgdm.pregrasp.sources import reset_pose
 from pgdm.sim.scene import Scene
 
 PLAN_SHARE = 0.7
-"""Of a trial's time that the planner takes, for the progress bar."""
+"""Share of the planner in a trial's time, for the progress bar."""
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a trial found of a pose."""
+    """Result of a trial."""
 
     reached: Start | None
-    """Where the plan ends, with the plan; None if it does not get there."""
+    """State in which the reach ends, with its plan; None if it does not reach the pose."""
     note: Mapping[str, Any]
-    """Figures, plain JSON."""
+    """Metrics, plain JSON."""
 
 
 class _CancelError(Exception):
-    """Somebody does not want to know any more."""
+    """The user has cancelled the trial."""
 
 
 class Trial:
-    """Tries a pose in a thread of its own.
+    """Tries a pose in its own thread.
 
     Args:
         scene: the task's, with the hand.
-        qpos: the pose to try, (nq,).
+        qpos: the pose to try (nq,).
         substeps: physics steps per control step.
-        told: told how far it is (0..1), and in words.
-        played: told the states of the plan, (nq,) each, at their speed; false ends the play.
-        ended: told what was found, None if nothing, and in words.
+        on_progress: receives the progress (0..1), and a description.
+        on_state: receives the states of the plan (nq,) in real time; returns false to stop.
+        on_end: receives the outcome, None without one, and a description.
     """
 
     def __init__(
@@ -55,20 +58,19 @@ class Trial:
         scene: Scene,
         qpos: np.ndarray,
         substeps: int,
-        told: Callable[[float, str], None],
-        played: Callable[[np.ndarray], bool],
-        ended: Callable[[Outcome | None, str], None],
+        on_progress: Callable[[float, str], None],
+        on_state: Callable[[np.ndarray], bool],
+        on_end: Callable[[Outcome | None, str], None],
     ) -> None:
         self._scene, self._qpos, self._substeps = scene, qpos, substeps
-        self._told, self._played, self._ended = told, played, ended
+        self._on_progress, self._on_state, self._on_end = on_progress, on_state, on_end
         self._cancelled = threading.Event()
-        # One core is left to the page.
-        self._threads = max(1, len(os.sched_getaffinity(0)) - 1)
+        self._threads = max(1, len(os.sched_getaffinity(0)) - 1)  # leaves a core to the page
         self._thread = threading.Thread(target=self._run, name="labeler-trial", daemon=True)
         self._thread.start()
 
     def cancel(self) -> None:
-        """Have it end soon, with nothing found."""
+        """Stop it soon, without an outcome."""
         self._cancelled.set()
 
     def _run(self) -> None:
@@ -78,34 +80,36 @@ class Trial:
         except _CancelError:
             pass
         except PgdmError as error:
-            text = f"not tried: {error}"
-        except Exception as error:  # noqa: BLE001 a defect must not leave the page waiting
+            text = f"trial failed: {error}"
+        except Exception as error:  # noqa: BLE001 a bug must not leave the page waiting
             _log.exception("the trial failed")
-            text = f"not tried, a defect of pgdm: {type(error).__name__}: {error}"
-        self._ended(outcome, text)
+            text = f"trial failed, bug in pgdm: {type(error).__name__}: {error}"
+        self._on_end(outcome, text)
 
     def _tried(self) -> tuple[Outcome, str]:
         began = time.monotonic()
-        self._told(0.0, "planning the way there")
+        self._on_progress(0.0, "planning the reach")
 
-        def progress(done: int, rounds: int, cost: float) -> None:
+        def progress(step: str, done: int, total: int) -> None:
             self._check()
-            left = (time.monotonic() - began) / done * (rounds - done)
-            text = f"planning the way there: round {done} of at most {rounds}, {left:.0f} s left"
-            self._told(PLAN_SHARE * done / rounds, text)
+            if not done:  # nothing to estimate from
+                return
+            left = (time.monotonic() - began) / done * (total - done)
+            text = f"planning the reach: round {done} of at most {total}, {left:.0f} s left"
+            self._on_progress(PLAN_SHARE * done / total, text)
 
         scene = self._scene
         plan = plan_reach(
             scene, self._qpos, self._substeps, num_threads=self._threads, progress=progress
         )
-        self._told(PLAN_SHARE, "grasping and lifting")
+        self._on_progress(PLAN_SHARE, "grasping and lifting")
         start = plan.state if plan.reached else Start(self._qpos, np.zeros(scene.model.nv), None)
         lift = LiftTest(scene, self._substeps, num_threads=self._threads)(start)
         self._check()
-        words = [_reach_words(plan), _lift_words(lift)]
-        note = {"reached": plan.reached, **_figures(plan, lift, self._palm_angle())}
-        text = "; ".join(words)
-        self._told(1.0, text)
+        palm = quality(scene, self._qpos, self._substeps, None).palm_angle_rad
+        note = {"reached": plan.reached, **_metrics(plan, lift, palm)}
+        text = f"{_reach_text(plan)}; {_lift_text(lift)}"
+        self._on_progress(1.0, text)
         self._play(plan)
         return Outcome(plan.state if plan.reached else None, note), text
 
@@ -113,37 +117,33 @@ class Trial:
         dt = self._scene.model.opt.timestep * self._substeps
         home = reset_pose(self._scene, self._qpos)
         for qpos in play(self._scene, plan.actions, home, self._substeps).qpos:
-            if self._cancelled.is_set() or not self._played(qpos):
+            if self._cancelled.is_set() or not self._on_state(qpos):
                 return
             time.sleep(dt)
-
-    def _palm_angle(self) -> float:
-        return quality(self._scene, self._qpos, self._substeps, None).palm_angle_rad
 
     def _check(self) -> None:
         if self._cancelled.is_set():
             raise _CancelError
 
 
-def _figures(plan: ReachPlan, lift: float, palm_angle_rad: float) -> dict[str, float]:
+def _metrics(plan: ReachPlan, lift: float, palm_angle_rad: float) -> dict[str, float]:
     names = ("base_error_m", "base_error_rad", "finger_error_rad", "object_moved_m", "seconds")
-    figures = {f"reach_{name}": float(getattr(plan, name)) for name in names}
-    figures["palm_angle_rad"] = palm_angle_rad
-    # A door has no lift rate, and JSON no NaN.
-    return figures if math.isnan(lift) else figures | {"lift_rate": lift}
+    metrics = {f"reach_{name}": float(getattr(plan, name)) for name in names}
+    metrics["palm_angle_rad"] = palm_angle_rad
+    return metrics if math.isnan(lift) else metrics | {"lift_rate": lift}  # JSON has no NaN
 
 
-def _reach_words(plan: ReachPlan) -> str:
+def _reach_text(plan: ReachPlan) -> str:
     if not plan.reached:
-        return f"the hand does not get there: {', '.join(plan.failures)}"
+        return f"the hand does not reach the pose: {', '.join(plan.failures)}"
     missed = max(plan.base_error_rad, plan.finger_error_rad)
     return (
-        f"the hand gets there, to {1e3 * plan.base_error_m:.1f} mm and {missed:.2f} rad, and moves "
-        f"the object by {1e3 * plan.object_moved_m:.1f} mm"
+        f"the hand reaches the pose within {1e3 * plan.base_error_m:.1f} mm and {missed:.2f} rad, "
+        f"and moves the object by {1e3 * plan.object_moved_m:.1f} mm"
     )
 
 
-def _lift_words(lift: float) -> str:
+def _lift_text(lift: float) -> str:
     if math.isnan(lift):
         return "the object cannot be lifted"
     return f"{lift:.0%} of random closing policies lift it"

@@ -1,5 +1,5 @@
 """Pre-grasps predicted from an object's shape.
 
-An object becomes its distances from fixed points around it, a hand a vector of numbers relative to
-the object; between them stands a Gaussian whose mean depends linearly on the distances.
+The object is encoded by its distances from fixed points around it, the hand by a vector relative to
+the object. A Gaussian over these vectors has a mean that is linear in the distances.
 """

@@ -1,27 +1,26 @@
-"""Candidates for a pre-grasp: sampled, made free of contact, ranked by what they can lift."""
+"""Candidates for a pre-grasp: sampled, freed from contact, ranked by the object's lift rate."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pgdm.errors import ConfigError, SceneError
 from pgdm.library import Start
+from pgdm.library.clearance import CLEARANCE_M, FreeingCfg, free_by_search
+from pgdm.library.progress import StepProgress, silent
 from pgdm.pregrasp.predict.encoding import object_code
 from pgdm.pregrasp.predict.grasp_vector import GraspFrame
 from pgdm.pregrasp.predict.predictor import Predictor
-from pgdm.pregrasp.predict.refine import freed
 from pgdm.pregrasp.quality import LiftTest, Quality, quality
+from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
 
-Progress = Callable[[int, int], None]
-"""Told how many steps of how many are done."""
-
 OVERSAMPLING = 3
-"""Samples for each candidate that is lift-tested."""
+"""Samples per candidate that is lift-tested."""
+_FREEING = FreeingCfg(0.01, 0.08, depth_weight=1e3, population=48, patience=6)
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Candidate:
     qpos: np.ndarray = field(repr=False)
     """Whole scene (nq,)."""
     moved_m: float
-    """Mean way of the fingertips from where they were predicted."""
+    """Mean distance of the fingertips from where they were predicted."""
     quality: Quality
 
 
@@ -41,24 +40,24 @@ def propose(
     objects: np.ndarray,
     count: int,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: StepProgress = silent,
 ) -> list[Candidate]:
-    """Sample hands for a scene's object and move them out of whatever they cut into.
+    """Sample hands for a scene's object and free them from penetration.
 
     Args:
-        predictor: of the scene's hand.
-        scene: of the task.
-        objects: a state (nq,) whose objects lie as they should.
+        predictor: predictor of the scene's hand.
+        scene: scene of the task.
+        objects: a state (nq,) with the objects in place.
         count: how many candidates.
-        seed: of the samples.
-        progress: told about samples.
+        seed: seed of the samples.
+        progress: called after each sample.
 
     Returns:
-        At most ``count``, most promising first; the hand's quality without its lift rate.
+        At most ``count``, most promising first; their quality lacks the lift rate.
 
     Raises:
-        ConfigError: the predictor is of another hand, or the object hangs on something.
-        SceneError: no sample could be made free.
+        ConfigError: the predictor is for another hand, or the object is attached to something.
+        SceneError: no sample could be freed.
     """
     if predictor.hand != scene.hand.name:
         raise ConfigError(
@@ -67,14 +66,14 @@ def propose(
         )
     if not scene.lies_free:
         raise ConfigError(
-            f"the object of task '{scene.task.id}' hangs on something: pre-grasps are predicted "
-            "for objects that lie free"
+            f"the object of task '{scene.task.id}' is attached to something: pre-grasps are only "
+            "predicted for objects that lie free"
         )
     frame = GraspFrame(scene, predictor.anchor_m)
     if len(predictor.mean) != frame.size:
         raise ConfigError(
-            f"the predictor of hand '{predictor.hand}' gives {len(predictor.mean)} numbers, in "
-            f"task '{scene.task.id}' it has {frame.size}: train it anew (pgdm pregrasp train)"
+            f"the predictor of hand '{predictor.hand}' gives {len(predictor.mean)} numbers, task "
+            f"'{scene.task.id}' needs {frame.size}: train it again (pgdm pregrasp train)"
         )
     vectors = predictor.sample(object_code(scene, objects), OVERSAMPLING * count, seed)
     return free_ones(frame, vectors, objects, seed, progress)[:count]
@@ -85,15 +84,15 @@ def free_ones(
     vectors: Sequence[np.ndarray] | np.ndarray,
     objects: np.ndarray,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: StepProgress = silent,
 ) -> list[Candidate]:
     """Return vectors as candidates that touch nothing, most promising first.
 
-    Those are that had to be moved least and whose fingertips are near the object: a hand that
-    hovers far away touches nothing either.
+    Promising are those that had to move little and whose fingertips are near the object: the order
+    is that of ``moved_m`` plus ``quality.fingertip_distance_m``.
 
     Raises:
-        SceneError: none could be made free.
+        SceneError: none could be freed.
     """
     scene, found = frame.scene, []
     for i, vector in enumerate(vectors):
@@ -102,33 +101,48 @@ def free_ones(
             away = frame.fingertips(qpos) - frame.fingertips_of(vector)
             moved = float(np.linalg.norm(away, axis=1).mean())
             found.append(Candidate(qpos, moved, quality(scene, qpos, 0, None)))
-        if progress is not None:
-            progress(i + 1, len(vectors))
+        progress("samples", i + 1, len(vectors))
     if not found:
         raise SceneError(
-            f"task '{scene.task.id}': none of {len(vectors)} predicted hands could be moved out of "
-            "what it cuts into; try more samples, or another seed"
+            f"task '{scene.task.id}': none of {len(vectors)} predicted hands could be freed from "
+            "penetration; try more samples, or another seed"
         )
     return sorted(found, key=lambda c: c.moved_m + c.quality.fingertip_distance_m)
 
 
-def ranked(
-    candidates: Sequence[Candidate], lift: LiftTest, progress: Progress | None = None
-) -> list[Candidate]:
-    """Return candidates with their lift rates, best first; of equal ones the nearest fingertips.
+def freed(scene: Scene, qpos: np.ndarray, seed: int = 0) -> np.ndarray | None:
+    """Return a state (nq,) near ``qpos`` in which the hand touches nothing, or None if not found.
 
-    An object that cannot be lifted leaves only the fingertips to rank by.
+    Objects stay, joints keep their limits, and equal arguments give an equal result.
+    """
+    model, contact, start = scene.model, HandContact(scene), qpos.copy()
+    count = scene.index.num_joints
+    start[:count] = qpos[:count].clip(*model.jnt_range[:count].T)
+    scene.index.couplings.apply(start)
+
+    def overlap(state: np.ndarray) -> float:
+        return contact.overlap(state, CLEARANCE_M)
+
+    if overlap(start) == 0.0:
+        return start
+    found, is_free = free_by_search(model, start, count, overlap, _FREEING, seed=seed)
+    return found if is_free else None
+
+
+def ranked(
+    candidates: Sequence[Candidate], lift: LiftTest, progress: StepProgress = silent
+) -> list[Candidate]:
+    """Return candidates with their lift rates, best first; ties by distance of the fingertips.
+
+    Objects that cannot be lifted are ranked by that distance alone.
     """
     tested = []
     for i, one in enumerate(candidates):
-        # One-DoF joints only: as many velocities as positions.
+        # All joints have one degree of freedom: as many velocities as positions.
         rate = lift(Start(one.qpos, np.zeros_like(one.qpos), None))
         tested.append(replace(one, quality=replace(one.quality, lift_rate=rate)))
-        if progress is not None:
-            progress(i + 1, len(candidates))
-    return sorted(tested, key=_rank)
-
-
-def _rank(candidate: Candidate) -> tuple[float, float]:
-    rate = candidate.quality.lift_rate
-    return (0.0 if math.isnan(rate) else -rate, candidate.quality.fingertip_distance_m)
+        progress("lift tests", i + 1, len(candidates))
+    return sorted(
+        tested,
+        key=lambda c: (-np.nan_to_num(c.quality.lift_rate), c.quality.fingertip_distance_m),
+    )

@@ -1,26 +1,24 @@
-"""From a predictor to a start: candidates, the best one that can be reached, and the way there."""
+"""From a predictor to a start: candidates, the best one that can be reached, and its reach."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from pgdm.errors import ConfigError
 from pgdm.library import Motion, Start
-from pgdm.library.pregrasp_file import Pregrasp
-from pgdm.library.report import Progress
-from pgdm.pregrasp import plans
+from pgdm.library.files.pregrasp import Pregrasp
+from pgdm.library.progress import Notify, StepProgress
 from pgdm.pregrasp.predict.candidates import Candidate, propose, ranked
 from pgdm.pregrasp.predict.predictor import Predictor, object_of
 from pgdm.pregrasp.quality import LiftTest
-from pgdm.pregrasp.reach import plan_reach
-from pgdm.pregrasp.reach_plan import ReachPlan
+from pgdm.pregrasp.reach.plan import ReachPlan
+from pgdm.pregrasp.reach.planner import plan_reach
+from pgdm.pregrasp.sources import reset_state
 from pgdm.sim.scene import Scene
 
-_TRIES = 3  # candidates to which a way is planned before the best one is taken without
+_TRIES = 3  # candidates to plan a reach for, before the best one is taken without
 
 
 @dataclass(frozen=True)
@@ -28,25 +26,25 @@ class PredictCfg:
     """How a start is predicted."""
 
     samples: int = 8
-    """Candidates that are lift-tested."""
+    """Number of candidates that are lift-tested."""
     seed: int = 0
-    """Of samples, lift test and reach plan."""
+    """Seed of samples, lift test and reach plan."""
     reach: bool = True
-    """Whether a way there is planned."""
+    """Whether to plan a reach."""
 
 
 @dataclass(frozen=True)
 class Predicted:
-    """What was predicted for a task."""
+    """The prediction for a task."""
 
     candidates: list[Candidate]
     """Best first."""
     chosen: int
-    """Number of the one that is taken."""
+    """Index of the chosen one."""
     plan: ReachPlan | None
-    """That leads there, if one does."""
+    """Its reach, if one was found."""
     pregrasp: Pregrasp
-    """The one that is taken, with its plan and a note of how it was made."""
+    """The chosen one, with its plan and a note of its origin."""
 
 
 def predict(
@@ -54,77 +52,68 @@ def predict(
     scene: Scene,
     motion: Motion,
     cfg: PredictCfg,
-    notify: Callable[[str], None],
-    progress: Progress,
+    notify: Notify,
+    progress: StepProgress,
     num_threads: int = 0,
 ) -> Predicted:
     """Predict a pre-grasp; equal arguments give an equal one, whatever the number of threads.
 
     Args:
-        predictor: of the scene's hand.
-        scene: of the task.
-        motion: of the task.
+        predictor: predictor of the scene's hand.
+        scene: scene of the task.
+        motion: motion of the task.
         cfg: how.
-        notify: told in a sentence what people should know.
-        progress: told how far it is.
+        notify: receives messages for the user.
+        progress: receives the progress.
         num_threads: 0 takes one per core.
 
     Raises:
-        ConfigError: the predictor is of another hand, the object hangs on something, or the motion
-            does not store where objects start.
-        SceneError: no candidate can be made free of contact.
+        ConfigError: the predictor is for another hand, the object is attached to something, or
+            the motion does not store where objects start.
+        SceneError: no candidate can be freed from contact.
     """
-    held_out = _say_training(predictor, scene, notify)
-    found = propose(
-        predictor, scene, _lying(motion, scene), cfg.samples, cfg.seed,
-        lambda i, n: progress("samples", i, n),
-    )  # fmt: skip
+    held_out = _is_held_out(predictor, scene, notify)
+    objects = reset_state(motion, scene)
+    found = propose(predictor, scene, objects, cfg.samples, cfg.seed, progress)
     lift = LiftTest(scene, motion.substeps, seed=cfg.seed, num_threads=num_threads)
-    found = ranked(found, lift, lambda i, n: progress("lift tests", i, n))
+    found = ranked(found, lift, progress)
     chosen, plan = 0, None
     for i, candidate in enumerate(found[:_TRIES] if cfg.reach else ()):
         tried = plan_reach(
             scene, candidate.qpos, motion.substeps, seed=cfg.seed, num_threads=num_threads,
-            progress=lambda done, most, _, i=i: progress(f"plan {i + 1}", done, most),
+            progress=lambda step, done, total, i=i: progress(f"plan {i + 1}", done, total),
         )  # fmt: skip
         if tried.reached:
             chosen, plan = i, tried
             break
         notify(f"candidate {i + 1} is not reached: {', '.join(tried.failures)}")
     best = found[chosen]
+    rate = best.quality.lift_rate
     note = {
         "made_by": "prediction",
         "held_out": held_out,
         "trained_on": list(predictor.tasks),
         "seed": cfg.seed,
         "rank": chosen + 1,
-        "lift_rate": None if math.isnan(best.quality.lift_rate) else best.quality.lift_rate,
+        "lift_rate": None if math.isnan(rate) else rate,
         "fingertip_distance_m": best.quality.fingertip_distance_m,
         "moved_m": best.moved_m,
     }
     if plan is not None:
-        note["reach"] = plans.figures(plan)
+        note["reach"] = plan.metrics()
     pose = Start(best.qpos, np.zeros(scene.model.nv), None)
     pregrasp = Pregrasp(pose, None if plan is None else plan.state, note)
     return Predicted(found, chosen, plan, pregrasp)
 
 
-def _say_training(predictor: Predictor, scene: Scene, notify: Callable[[str], None]) -> bool:
-    """Tell whether the predictor has seen the object, and return whether it has not."""
+def _is_held_out(predictor: Predictor, scene: Scene, notify: Notify) -> bool:
+    """Return whether the predictor was fitted without the object, and tell the user."""
     name = object_of(scene)
     if name not in predictor.objects:
-        notify(f"object '{name}' is held out: the predictor has seen no pre-grasp of it")
+        notify(f"object '{name}' is held out: the predictor was trained without it")
         return True
     notify(
-        f"object '{name}' was in the training set: this is no prediction for an unseen object. "
-        f"For one: pgdm pregrasp train --hand {predictor.hand} --leave-out {name}"
+        f"object '{name}' was in the training set: this is not a prediction for an unseen object. "
+        f"To hold it out: pgdm pregrasp train --hand {predictor.hand} --leave-out {name}"
     )
     return False
-
-
-def _lying(motion: Motion, scene: Scene) -> np.ndarray:
-    """Return a state (nq,) with the hand at its reset pose and the objects where episodes start."""
-    if "mined" not in motion.starts:
-        raise ConfigError(f"motion '{motion.id}' does not store where its objects start")
-    stored, model = motion.starts["mined"].qpos, scene.model
-    return np.concatenate((np.zeros(model.nu), stored[len(stored) - (model.nq - model.nu) :]))

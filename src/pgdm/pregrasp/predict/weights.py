@@ -1,20 +1,20 @@
-"""A predictor's file: plain tensors, numbers and names, read without running code from it."""
+"""A predictor's file: plain tensors, numbers and names; reading it never runs code from it."""
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from pgdm import paths
+from pgdm import files, paths
 from pgdm.errors import ConfigError, CorruptAssetError
 from pgdm.pregrasp.predict.encoding import BASIS_POINTS
 from pgdm.pregrasp.predict.predictor import Predictor
 
 FORMAT = "pgdm-predictor-1"
-"""Changes when the encoding or the vectors do."""
+"""Changes with the encoding and the grasp vectors."""
 
 _ARRAYS = ("anchor_m", "code_mean", "slope", "mean", "factor")
 _NUMBERS = ("penalty", "error_m", "mean_hand_error_m")
@@ -22,12 +22,12 @@ _NAMES = ("tasks", "objects", "left_out")
 
 
 def path_of(hand: str) -> Path:
-    """Return where the user's predictor of a hand lies, or would lie."""
-    return paths.user() / "predictors" / f"{hand}.pt"
+    """Return the path of the user's predictor of a hand, which may not exist."""
+    return paths.inside(paths.user() / "predictors", hand, kind="hand", suffix=".pt")
 
 
 def write(path: Path, predictor: Predictor) -> None:
-    """Write a predictor, whole or not at all.
+    """Write a predictor atomically.
 
     Raises:
         OSError: it cannot be written.
@@ -46,28 +46,27 @@ def read(path: Path, hand: str) -> Predictor:
     """Read the predictor of a hand.
 
     Raises:
-        ConfigError: there is none, or it is of another hand.
+        ConfigError: there is none, or it is for another hand.
         CorruptAssetError: the file is damaged, or of another format.
     """
-    cure = f"'pgdm pregrasp train --hand {hand}' makes it"
+    cure = f"train one with 'pgdm pregrasp train --hand {hand}'"
     if not path.is_file():
         raise ConfigError(f"{path}: there is no predictor for hand '{hand}'; {cure}")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError) as error:
-        reason = str(error).partition("\n")[0]
-        raise CorruptAssetError(f"{path}: damaged ({reason}); {cure} anew") from error
+        content = files.parse_tensors(files.read_bytes(path))
+    except (OSError, ValueError) as error:
+        raise CorruptAssetError(f"{path}: damaged ({error}); {cure}") from error
     found = content.get("format") if isinstance(content, dict) else None
     if not isinstance(content, dict) or found != FORMAT:
-        raise CorruptAssetError(f"{path}: is of format '{found}', not '{FORMAT}'; {cure} anew")
+        raise CorruptAssetError(f"{path}: is of format '{found}', not '{FORMAT}'; {cure}")
     if content.get("hand") != hand:
         raise ConfigError(f"{path}: is for hand '{content.get('hand')}', not '{hand}'; {cure}")
     try:
-        arrays = {name: _array(content, name) for name in _ARRAYS}
-        penalty, error, mean_hand_error = (float(content[name]) for name in _NUMBERS)
-        tasks, objects, left_out = (tuple(map(str, content[name])) for name in _NAMES)
-    except (KeyError, TypeError, ValueError) as problem:
-        raise CorruptAssetError(f"{path}: lacks or spoils {problem}; {cure} anew") from problem
+        arrays: dict[str, Any] = {name: _array(content, name) for name in _ARRAYS}
+        values: dict[str, Any] = {name: float(content[name]) for name in _NUMBERS}
+        values |= {name: tuple(map(str, content[name])) for name in _NAMES}
+    except (KeyError, TypeError, ValueError, OverflowError) as problem:
+        raise CorruptAssetError(f"{path}: missing or invalid: {problem}; {cure}") from problem
     size = arrays["mean"].size
     wanted = {
         "mean": (size,),
@@ -79,18 +78,9 @@ def read(path: Path, hand: str) -> Predictor:
     for name, shape in wanted.items():
         if arrays[name].shape != shape:
             raise CorruptAssetError(
-                f"{path}: '{name}' has shape {arrays[name].shape}, not {shape}; {cure} anew"
+                f"{path}: '{name}' has shape {arrays[name].shape}, not {shape}; {cure}"
             )
-    return Predictor(
-        hand=hand,
-        **arrays,
-        penalty=penalty,
-        tasks=tasks,
-        objects=objects,
-        left_out=left_out,
-        error_m=error,
-        mean_hand_error_m=mean_hand_error,
-    )
+    return Predictor(hand=hand, **values, **arrays)
 
 
 def _array(content: dict[str, object], name: str) -> np.ndarray:

@@ -1,1 +1,0 @@
-"""``hydra/sweeper=pgdm``: a thin shell around ``pgdm.sweep.expand``."""

@@ -1,0 +1,328 @@
+"""Which links of a hand are its palm, its fingers and its thumb, and where its points are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+from pgdm.errors import ConfigError, check_name
+from pgdm.library.couplings import Couplings
+
+HUMAN = ("index", "middle", "ring", "little", "thumb")
+"""Human fingers, in the order of a hand's settings."""
+PREFIXES = {"index": "ff", "middle": "mf", "ring": "rf", "little": "lf", "thumb": "th"}
+"""Prefixes of the points, as in the benchmark's hands."""
+
+_WORDS = {
+    "index": ("index", "fore", "ff", "if"),
+    "middle": ("middle", "mf"),
+    "ring": ("ring", "rf"),
+    "little": ("little", "pinky", "lf", "pf"),
+    "thumb": ("thumb", "th"),
+}
+"""Words in the names of links and joints; those of two letters count at the beginning only."""
+_MOST_WRIST = 3  # joints that move the palm; more are an arm
+_SAME_M = 0.005  # joints nearer to each other than this are one knuckle
+_PAD_M = 0.012  # from the end of a finger to the middle of its pad
+_ALONG = 0.8  # cosine from which on a joint's axis runs along the link and not across
+_PALM_M = 0.09  # length of a palm without any geometry
+
+
+@dataclass(frozen=True)
+class Finger:
+    """One finger."""
+
+    human: str
+    """Human finger that it follows, of :data:`HUMAN`."""
+    joints: list[int]
+    """Its joints from the palm outwards."""
+    link: int
+    """Body of its last link."""
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """The parts of a hand, of a model whose first joints are not yet those of a base."""
+
+    palm: int
+    """Body that carries the fingers; 0 if they are fixed to the world."""
+    wrist_joints: list[int]
+    """Joints that move the palm."""
+    fingers: list[Finger]
+    """In the order of :data:`HUMAN`."""
+    points: dict[str, tuple[str, np.ndarray]] = field(repr=False)
+    """Name of the body, and place (3,) m in its frame of each point, the wrist's first."""
+    wrist: np.ndarray
+    """Where the wrist is (3,) m, in the model's world frame."""
+    along: np.ndarray
+    """Direction (3,) of the straight fingers."""
+    across: np.ndarray
+    """Direction (3,) from the index finger's side to the little finger's."""
+    found_by: str
+    """``names``, ``geometry`` or ``--fingers``."""
+
+
+def straight(model: mujoco.MjModel) -> mujoco.MjData:
+    """Return the kinematics of a hand with its joints at zero, or as near to it as they go."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.zeros(model.nq).clip(*model.jnt_range.T)
+    Couplings(model, model.njnt).apply(data.qpos)
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def find(model: mujoco.MjModel, chosen: Mapping[str, str], label: str) -> Anatomy:
+    """Find palm, fingers and points of a hand.
+
+    A finger is a chain of joints that ends in a link without further joints; the palm is the link
+    from which the fingers branch.
+
+    Args:
+        model: the hand alone.
+        chosen: link or joint of each human finger, if the user names them.
+        label: the hand's file, for messages.
+
+    Raises:
+        ConfigError: it has fewer than three or more than five fingers, is on an arm, or a finger
+            cannot be told from the others.
+    """
+    moved = model.body_jntnum > 0
+    parents = model.body_parentid
+    inner = {int(b) for body in np.flatnonzero(moved) for b in _ancestors(parents, int(body))[1:]}
+    tips = [int(body) for body in np.flatnonzero(moved) if body not in inner]
+    if not 3 <= len(tips) <= len(HUMAN):
+        raise ConfigError(
+            f"{label}: {len(tips)} chains of joints end in a fingertip "
+            f"({_listed(_name(model, t) for t in tips)}); pgdm's hands have 3 to 5 fingers"
+        )
+    paths = [_ancestors(parents, tip) for tip in tips]
+    palm = next(body for body in paths[0] if all(body in path for path in paths))
+    above = _ancestors(parents, palm)
+    wrist_joints = sorted(j for j in range(model.njnt) if model.jnt_bodyid[j] in above)
+    if len(wrist_joints) > _MOST_WRIST:
+        raise ConfigError(
+            f"{label}: {len(wrist_joints)} joints move the palm '{_name(model, palm)}': it is on "
+            "an arm. Cut the file to the hand: pgdm gives it six base joints in place of the arm"
+        )
+    chains = [_joints(model, path[: path.index(palm)]) for path in paths]
+    for one, tip in zip(chains, tips, strict=True):
+        shared = {j for other in chains if other is not one for j in other} & set(one)
+        if shared:
+            raise ConfigError(
+                f"{label}: '{_name(model, tip)}' shares joint "
+                f"'{model.joint(min(shared)).name}' with another finger; each needs its own"
+            )
+    data = straight(model)
+    ends = {tip: _end(model, data, tip, label) for tip in tips}
+    human, found_by = _humans(model, data, chains, tips, ends, chosen, label)
+    order = sorted(range(len(tips)), key=lambda i: HUMAN.index(human[i]))
+    fingers = [Finger(human[i], chains[i], tips[i]) for i in order]
+    others = [f for f in fingers if f.human != "thumb"]
+    knuckles = np.array([_middle(model, data, f.joints, 0) for f in others])
+    along = _unit(np.array([ends[f.link] for f in others]).mean(0) - knuckles.mean(0))
+    across = knuckles[-1] - knuckles[0]
+    across = _unit(across - along * (along @ across))
+    wrist = _wrist(model, data, palm, wrist_joints, knuckles.mean(0), along)
+    points = {"wrist_point": (model.body(palm).name, _local(data, palm, wrist))}
+    for finger in fingers:
+        for part, (body, place) in _points(data, model, finger, ends[finger.link]).items():
+            name = f"{PREFIXES[finger.human]}{part}_point"
+            points[name] = model.body(body).name, _local(data, body, place)
+    return Anatomy(palm, wrist_joints, fingers, points, wrist, along, across, found_by)
+
+
+def _humans(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    chains: list[list[int]],
+    tips: list[int],
+    ends: Mapping[int, np.ndarray],
+    chosen: Mapping[str, str],
+    label: str,
+) -> tuple[list[str], str]:
+    """Return the human finger of each chain, and how it was found."""
+    names = [_names(model, chain, tip) for chain, tip in zip(chains, tips, strict=True)]
+    if chosen:
+        return _chosen(names, tips, model, chosen, label), "--fingers"
+    by_name = [_by_words(words) for words in names]
+    if None not in by_name and len(set(by_name)) == len(by_name) and "thumb" in by_name:
+        return [str(one) for one in by_name], "names"
+    thumbs = [i for i, one in enumerate(by_name) if one == "thumb"]
+    places = np.array([ends[tip] for tip in tips])
+    far = [np.linalg.norm(p - (places.sum(0) - p) / (len(tips) - 1)) for p in places]
+    thumb = thumbs[0] if len(thumbs) == 1 else int(np.argmax(far))
+    knuckles = np.array([data.xanchor[chain[0]] for chain in chains])
+    others = [i for i in range(len(tips)) if i != thumb]
+    spread = knuckles[others] - knuckles[others].mean(0)
+    axis = np.linalg.svd(spread)[2][0]
+    axis *= -1.0 if (knuckles[thumb] - knuckles[others].mean(0)) @ axis > 0 else 1.0
+    others.sort(key=lambda i: float(knuckles[i] @ axis))
+    human = dict(zip(others, HUMAN, strict=False)) | {thumb: "thumb"}
+    return [human[i] for i in range(len(tips))], "geometry"
+
+
+def _chosen(
+    names: list[set[str]],
+    tips: list[int],
+    model: mujoco.MjModel,
+    chosen: Mapping[str, str],
+    label: str,
+) -> list[str]:
+    found: dict[int, str] = {}
+    for human, name in chosen.items():
+        check_name("human finger of --fingers", human, HUMAN)
+        with_it = [i for i, known in enumerate(names) if name in known]
+        if len(with_it) != 1 or with_it[0] in found:
+            raise ConfigError(
+                f"{label}: --fingers {human}={name} names no finger of its own; the last links "
+                f"are {_listed(_name(model, tip) for tip in tips)}"
+            )
+        found[with_it[0]] = human
+    if len(found) < len(tips) or "thumb" not in found.values():
+        missing = [_name(model, tip) for i, tip in enumerate(tips) if i not in found]
+        raise ConfigError(
+            f"{label}: --fingers must name every finger, and a thumb; it lacks "
+            f"{_listed(missing) or 'the thumb'}"
+        )
+    return [found[i] for i in range(len(tips))]
+
+
+def _by_words(names: set[str]) -> str | None:
+    """Return the human finger that most names of a finger speak of, or None."""
+    counts = {
+        human: sum(any(_says(name.lower(), word) for word in words) for name in names)
+        for human, words in _WORDS.items()
+    }
+    best = max(counts, key=lambda human: counts[human])
+    rivals = [human for human in counts if counts[human] == counts[best]]
+    return best if counts[best] and len(rivals) == 1 else None
+
+
+def _says(name: str, word: str) -> bool:
+    return name.startswith(word) if len(word) == 2 else word in name
+
+
+def _names(model: mujoco.MjModel, chain: list[int], tip: int) -> set[str]:
+    bodies = {int(model.jnt_bodyid[j]) for j in chain} | set(_welded(model, tip))
+    return {_name(model, body) for body in bodies} | {model.joint(j).name for j in chain}
+
+
+def _points(
+    data: mujoco.MjData, model: mujoco.MjModel, finger: Finger, end: np.ndarray
+) -> dict[str, tuple[int, np.ndarray]]:
+    """Return body and place, world frame, of a finger's knuckle, middle and distal point."""
+    anchors = np.array([_middle(model, data, finger.joints, k) for k in range(len(finger.joints))])
+    knuckle = anchors[0]
+    half = 0.5 * float(np.linalg.norm(end - knuckle))
+    away = np.linalg.norm(anchors - knuckle, axis=1)
+    inner = [i for i in range(len(anchors)) if away[i] > _SAME_M]
+    middle = finger.link, 0.5 * (knuckle + end)
+    if inner:
+        best = min(inner, key=lambda i: abs(away[i] - half))
+        middle = int(model.jnt_bodyid[finger.joints[best]]), anchors[best]
+    first = int(model.jnt_bodyid[finger.joints[0]])
+    return {"knuckle": (first, knuckle), "middle": middle, "distal": (finger.link, end)}
+
+
+def _end(model: mujoco.MjModel, data: mujoco.MjData, tip: int, label: str) -> np.ndarray:
+    """Return the middle of a fingertip's pad (3,) m, world frame."""
+    corners = _corners(model, data, _welded(model, tip))
+    if not len(corners):
+        raise ConfigError(
+            f"{label}: fingertip '{_name(model, tip)}' has no collision geometry, so it could not "
+            "touch anything; give its link some"
+        )
+    last = int(model.body_jntadr[tip] + model.body_jntnum[tip] - 1)
+    start = _middle(model, data, [last], 0)
+    along = _unit(0.5 * (corners.min(0) + corners.max(0)) - start)
+    length = float(((corners - start) @ along).max())
+    return start + max(0.5 * length, length - _PAD_M) * along
+
+
+def _middle(
+    model: mujoco.MjModel, data: mujoco.MjData, joints: list[int], number: int
+) -> np.ndarray:
+    """Return the point (3,) m of a finger's joint that is beside the middle of the link it moves.
+
+    A file may put the anchor anywhere along a hinge's axis, such as at the side of the link.
+    """
+    joint = joints[number]
+    anchor, axis = data.xanchor[joint], data.xaxis[joint]
+    for outer in joints[number:]:
+        corners = _corners(model, data, _welded(model, int(model.jnt_bodyid[outer])))
+        if not len(corners):
+            continue
+        middle = 0.5 * (corners.min(0) + corners.max(0))
+        if abs(_unit(middle - anchor) @ axis) < _ALONG:
+            anchor = anchor + axis * (axis @ (middle - anchor))
+        break
+    return anchor.copy()
+
+
+def _wrist(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    palm: int,
+    wrist_joints: list[int],
+    knuckles: np.ndarray,
+    along: np.ndarray,
+) -> np.ndarray:
+    """Return the wrist (3,) m: the last wrist joint, else the palm's end behind the knuckles."""
+    if wrist_joints:
+        return data.xanchor[wrist_joints[-1]].copy()
+    corners = _corners(model, data, _welded(model, palm))
+    back = float(((corners - knuckles) @ along).min()) if len(corners) else -_PALM_M
+    return knuckles + min(back, 0.0) * along
+
+
+def _corners(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> np.ndarray:
+    """Return the corners (N, 3) m, world frame, of the boxes around the solid geoms of bodies."""
+    solid = (model.geom_contype | model.geom_conaffinity) != 0
+    geoms = np.flatnonzero(solid & np.isin(model.geom_bodyid, bodies))
+    signs = np.stack(np.meshgrid(*([[-1.0, 1.0]] * 3)), axis=-1).reshape(-1, 3)
+    corners = [
+        data.geom_xpos[g]
+        + (model.geom_aabb[g, :3] + signs * model.geom_aabb[g, 3:])
+        @ data.geom_xmat[g].reshape(3, 3).T
+        for g in geoms
+    ]
+    return np.concatenate(corners) if corners else np.empty((0, 3))
+
+
+def _welded(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return the bodies that move as one with a body."""
+    return np.flatnonzero(model.body_weldid == model.body_weldid[body]).tolist()
+
+
+def _ancestors(parents: np.ndarray, body: int) -> list[int]:
+    """Return a body and those that carry it, the world last."""
+    path = [int(body)]
+    while path[-1]:
+        path.append(int(parents[path[-1]]))
+    return path
+
+
+def _joints(model: mujoco.MjModel, bodies: list[int]) -> list[int]:
+    """Return the joints of bodies listed from a fingertip inwards, the outermost last."""
+    starts = [(int(model.body_jntadr[b]), int(model.body_jntnum[b])) for b in reversed(bodies)]
+    return [j for start, count in starts for j in range(start, start + count)]
+
+
+def _local(data: mujoco.MjData, body: int, place: np.ndarray) -> np.ndarray:
+    return (place - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
+
+
+def _name(model: mujoco.MjModel, body: int) -> str:
+    return model.body(int(body)).name or f"body {body}"
+
+
+def _listed(names: object) -> str:
+    listed = [f"'{name}'" for name in names]  # type: ignore[attr-defined]
+    return ", ".join(listed[:8]) + (f" and {len(listed) - 8} more" if len(listed) > 8 else "")
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)

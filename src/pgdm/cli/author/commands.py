@@ -1,0 +1,248 @@
+"""``pgdm author``: its commands and their options; a module named like each does the work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pgdm.cli.console.screen import loading
+from pgdm.cli.options import Offline, check_hand, existing
+from pgdm.config.groups import conf_dir
+from pgdm.config.suites import suites
+from pgdm.errors import ConfigError, check_name
+from pgdm.library import open_library
+from pgdm.library.authored import own
+
+app = typer.Typer(
+    help="Make your own objects from meshes, hands from models, and tasks from motions.",
+    no_args_is_help=True,
+)
+
+
+@app.command("object")
+def make_object(
+    mesh: Annotated[
+        Path, typer.Argument(metavar="MESH", help="STL, OBJ, PLY, GLB or OFF.", callback=existing)
+    ],
+    name: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="Name of the object: lower-case letters, digits, '_'."),
+    ],
+    scale: Annotated[
+        float | None, typer.Option(help="Metres in one unit of the file [1].", metavar="S")
+    ] = None,
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of the file: mm, cm or m.", metavar="UNIT")
+    ] = None,
+    mass: Annotated[
+        float | None,
+        typer.Option(help="Mass, kg; by default from volume and density.", metavar="KG"),
+    ] = None,
+    density: Annotated[
+        float | None,
+        typer.Option(
+            help="Density, kg/m3 [1250: PLA, as in the benchmark's printed objects].",
+            metavar="D",
+        ),
+    ] = None,
+    parts: Annotated[
+        int | None, typer.Option(help="Convex parts at most, 1 to 64.", metavar="N")
+    ] = None,
+    threshold: Annotated[
+        float, typer.Option(help="Concavity that may remain, 0.01 to 1; lower gives more parts.")
+    ] = 0.05,
+    licence: Annotated[
+        str, typer.Option(help="Licence of the mesh, recorded with the object.")
+    ] = "unstated",
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace an object of that name.")
+    ] = False,
+) -> None:
+    """Make an object from a mesh.
+
+    The mesh is repaired, checked, split into convex parts, weighed, dropped and drawn into
+    picture.png in the object's folder.
+    """
+    own.check_object_name(name, replace)
+    with loading():
+        from pgdm.cli.author.object import metres, run
+        from pgdm.library.authored.object import DENSITY, ObjectRequest
+        from pgdm.library.authored.parts import PartsCfg
+
+    factor = metres(scale, unit)
+    if mass is not None and density is not None:
+        raise ConfigError("--mass and --density both give the mass; use one of them")
+    cfg = PartsCfg(threshold, parts)
+    material = DENSITY if density is None else density
+    run(ObjectRequest(mesh, name, factor, mass, material, cfg, licence, replace))
+
+
+@app.command("hand")
+def make_hand(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="MJCF or URDF.", callback=existing)],
+    name: Annotated[
+        str, typer.Option(metavar="NAME", help="Name of the hand: lower-case letters, digits, '_'.")
+    ],
+    fingers: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A link of each finger, if they are not found: thumb=LINK,index=LINK,...",
+            metavar="LIST",
+        ),
+    ] = None,
+    reset: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Joints of the reset pose, rad: JOINT=ANGLE,... [zero, or the nearest limit].",
+            metavar="LIST",
+        ),
+    ] = None,
+    mount: Annotated[
+        str,
+        typer.Option(help="Where the wrist is at the start, m: forward is y.", metavar="X,Y,Z"),
+    ] = "0,-0.27,0.2",
+    turn: Annotated[
+        str,
+        typer.Option(
+            help="Turn it about the axes x, y, z, degrees, from fingers forward and palm down.",
+            metavar="X,Y,Z",
+        ),
+    ] = "0,0,0",
+    kp: Annotated[
+        float | None,
+        typer.Option(help="Gain of the finger servos, N m/rad [the file's, or 3].", metavar="KP"),
+    ] = None,
+    drop_tendons: Annotated[
+        bool, typer.Option("--drop-tendons", help="Leave out tendons that actuators pull.")
+    ] = False,
+    root: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder that the meshes must not leave [the file's own].",
+            metavar="DIR",
+            callback=existing,
+        ),
+    ] = None,
+    licence: Annotated[
+        str, typer.Option(help="Licence of the model, recorded with the hand.")
+    ] = "unstated",
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace a hand of that name.")
+    ] = False,
+) -> None:
+    """Make a hand from MJCF or URDF.
+
+    It gets six base joints, a position servo for each joint, points to observe, a reset pose and
+    a mean hand; it is checked and drawn into picture.png in the hand's folder.
+    """
+    shipped = [path.stem for path in (conf_dir() / "hand").glob("*.yaml")]
+    own.check_hand_name(name, shipped, replace)
+    with loading():
+        from pgdm.author.hand import HandRequest
+        from pgdm.cli.author.hand import angles, numbers, pairs, run
+
+    run(
+        HandRequest(
+            file=file,
+            name=name,
+            root=root,
+            fingers=pairs("--fingers", fingers) if fingers else {},
+            reset=angles(reset) if reset else {},
+            kp=kp,
+            place=numbers("--mount", mount),
+            turn_deg=numbers("--turn", turn),
+            drop_tendons=drop_tendons,
+            licence=licence,
+            replace=replace,
+        )
+    )
+
+
+@app.command("task")
+def make_task(
+    object_name: Annotated[
+        str, typer.Option("--object", metavar="NAME", help="Object, yours or the library's.")
+    ],
+    task: Annotated[
+        str, typer.Option("--id", metavar="ID", help="Id of the new task, such as gear-lift.")
+    ],
+    hand: Annotated[
+        str, typer.Option(help="adroit, dhand, dmanus, or your own.", callback=check_hand)
+    ] = "adroit",
+    keyframes: Annotated[
+        Path | None,
+        typer.Option(help="YAML file of keyframes.", metavar="FILE", callback=existing),
+    ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="Recorded poses: .csv, .npz or .json.", metavar="FILE", callback=existing
+        ),
+    ] = None,
+    origin: Annotated[
+        str,
+        typer.Option(
+            help="Point whose positions were recorded: com, or mesh (the origin of its file)."
+        ),
+    ] = "com",
+    pregrasp: Annotated[
+        str,
+        typer.Option(
+            help="mean or open: search for a pose near the object with fingers close to the mean "
+            "or the open hand; later: no pre-grasp yet; a pre-grasp's .npz; or a task whose finger "
+            "pose to keep close to.",
+            metavar="WHICH",
+        ),
+    ] = "mean",
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Filter the motion, and start and end it at rest.")
+    ] = False,
+    slower: Annotated[float, typer.Option(help="Slow the motion down by this factor.")] = 1.0,
+    lift_above_table: Annotated[
+        bool, typer.Option("--lift-above-table", help="Raise poses that cut into the table.")
+    ] = False,
+    settle: Annotated[
+        bool, typer.Option("--settle", help="Shift the motion to where the object comes to rest.")
+    ] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace a task of that id.")] = False,
+    offline: Offline = False,
+) -> None:
+    """Make a task from an object, a hand and a motion.
+
+    pgdm-run task=ID then trains it.
+    """
+    own.check_task_name(task, suites(), replace)
+    library = open_library()
+    # An empty one is filled first, since hands and table come with it.
+    if library.is_filled:
+        check_name("object", object_name, library.objects())
+    with loading():
+        from pgdm.author import TaskRequest
+        from pgdm.author.motion import MotionRequest
+        from pgdm.cli.author.task import run
+
+    motion = MotionRequest(keyframes, poses, origin, smooth, slower, lift_above_table, settle)
+    run(TaskRequest(task, object_name, hand, motion, pregrasp, replace), offline)
+
+
+@app.command("list")
+def list_own() -> None:
+    """List your own objects, hands and tasks."""
+    from pgdm.cli.author.list import run
+
+    run()
+
+
+@app.command("remove")
+def remove_own(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="One of your objects, hands or tasks.")
+    ],
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
+) -> None:
+    """Remove one of your objects, hands or tasks; this cannot be undone."""
+    from pgdm.cli.author.remove import run
+
+    run(name, yes)

@@ -1,0 +1,45 @@
+"""``pgdm deploy check``: the form of a playback, and the limits of the arm."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pgdm.cli.console.screen import console
+from pgdm.deploy import limits
+from pgdm.deploy.playback import Playback, read
+
+
+def run_check(file: Path) -> int:
+    """Print what a playback holds and which limits it exceeds; return the exit code.
+
+    Raises:
+        PlaybackError: if the file is no playback.
+    """
+    playback = read(file)
+    used = limits.usage(playback.time_s, playback.arm_joints_rad)
+    describe(file, playback, used)
+    return 1 if used.violations else 0
+
+
+def describe(file: Path, playback: Playback, used: limits.Usage) -> None:
+    """Print what a playback holds, how much of the arm's limits it uses, and its violations."""
+    say = partial(console().print, soft_wrap=True, markup=False, highlight=False)
+    count, hand = len(playback.time_s), len(playback.hand_joints)
+    task = playback.facts.get("task", "no task")
+    say(f"{file}: {task}, {playback.duration_s:.2f} s, {count} samples, {hand} hand joints")
+    room = used.share["position"]
+    say(f"position: at least {room.min():.3f} rad from its limits ({_joint(-room)})")
+    for name in ("velocity", "acceleration", "jerk"):
+        share = used.share[name]
+        say(f"{name}: {100 * share.max():.0f}% of its limit ({_joint(share)})")
+    for violation in used.violations:
+        say(f"violation: {violation.described}")
+    if used.violations and used.slower < 1:
+        say(f"within velocity, acceleration and jerk at {used.slower:.2f} of this speed")
+
+
+def _joint(share: np.ndarray) -> str:
+    return limits.JOINTS[int(share.argmax())]

@@ -1,0 +1,187 @@
+"""``pgdm deploy``: its commands and their options; a module named like each does the work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pgdm.cli.console.screen import loading
+from pgdm.cli.options import Offline, Video, existing, known_run
+from pgdm.errors import ConfigError
+
+app = typer.Typer(help="Play a trained policy on a Franka Panda arm.", no_args_is_help=True)
+
+_File = Annotated[
+    Path, typer.Argument(metavar="FILE", help="A playback: .npz or .csv.", callback=existing)
+]
+
+
+def _numbers(count: int, what: str) -> Callable[[typer.CallbackParam, str | None], str | None]:
+    def check(param: typer.CallbackParam, text: str | None) -> str | None:
+        if text is not None:
+            try:
+                fits = len([float(word) for word in text.split()]) == count
+            except ValueError:
+                fits = False
+            if not fits:
+                raise ConfigError(f"--{param.name} '{text}': give {count} numbers, {what}")
+        return text
+
+    return check
+
+
+def _floats(text: str | None) -> tuple[float, ...] | None:
+    return None if text is None else tuple(float(word) for word in text.split())
+
+
+@app.command("export")
+def export_playback(
+    run: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN", help="Folder of a run, or one of its checkpoints.", callback=known_run
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="File to write: .npz or .csv.")],
+    episodes: Annotated[
+        int, typer.Option(min=1, help="Episodes to choose from; the best is exported.")
+    ] = 16,
+    sampled: Annotated[
+        bool, typer.Option("--sampled", help="Draw actions instead of taking the mean action.")
+    ] = False,
+    best: Annotated[
+        bool, typer.Option("--best", help="Use the run's best checkpoint instead of its last.")
+    ] = False,
+    base: Annotated[
+        str,
+        typer.Option(
+            help="Base of the hand: where it was (reached), or its targets (commanded).",
+            metavar="KIND",
+        ),
+    ] = "reached",
+    speed: Annotated[float, typer.Option(help="Fraction of the simulation's speed.")] = 1.0,
+    smooth: Annotated[
+        float, typer.Option(help="Smoothing of the commands, standard deviation, s.")
+    ] = 0.04,
+    hold: Annotated[float, typer.Option(min=0, help="Hold the end for so long, s.")] = 1.0,
+    rate: Annotated[float, typer.Option(min=10, max=1000, help="Samples a second.")] = 100.0,
+    arm: Annotated[
+        str | None,
+        typer.Option(
+            metavar="'X Y TURN'",
+            help="Arm's base in the world: x and y, m, and turn, degrees [by hand].",
+            callback=_numbers(3, "x y turn"),
+        ),
+    ] = None,
+    table_height: Annotated[
+        float, typer.Option(metavar="M", help="Table top above the arm's base, m.")
+    ] = 0.0,
+    mount: Annotated[
+        str | None,
+        typer.Option(
+            metavar="'X Y Z R P Y'",
+            help="Hand's mount body at the flange: m, then roll, pitch, yaw, degrees [by hand].",
+            callback=_numbers(6, "x y z roll pitch yaw"),
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write the file although the arm cannot play it.")
+    ] = False,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the episodes; by default that of the run.")
+    ] = None,
+    offline: Offline = False,
+) -> None:
+    """Convert an episode of a trained policy into commands for arm and hand.
+
+    The six base joints of the hand become the seven joints of a Franka Panda.
+    """
+    from pgdm.deploy.names import check_base, check_suffix
+
+    check_suffix(out)
+    check_base(base)
+    with loading():
+        from pgdm.cli.deploy.export import ExportRequest, Place, run_export
+        from pgdm.deploy.convert import ConvertCfg
+
+    cfg = ConvertCfg(base, smooth, hold, rate, speed)
+    place = Place(_floats(arm), table_height, _floats(mount))
+    request = ExportRequest(run, out, episodes, sampled, best, force, seed, offline)
+    raise typer.Exit(run_export(request, cfg, place))
+
+
+@app.command("check")
+def check_playback(file: _File) -> None:
+    """Check a playback file: its form, and the limits of the arm."""
+    with loading():
+        from pgdm.cli.deploy.check import run_check
+
+    raise typer.Exit(run_check(file))
+
+
+@app.command("simulate")
+def simulate_playback(
+    file: _File,
+    boxes: Annotated[
+        int, typer.Option(min=1, help="Objects to try; each is drawn anew in a randomised task.")
+    ] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the objects.")] = 0,
+    video: Video = None,
+    offline: Offline = False,
+) -> None:
+    """Play a file open-loop on arm and hand in simulation, and say what was lifted.
+
+    Arm and hand follow the commands with joint controllers; nothing is corrected on the way.
+    """
+    with loading():
+        from pgdm.cli.deploy.simulate import SimulateRequest, run_simulate
+
+    raise typer.Exit(run_simulate(SimulateRequest(file, boxes, seed, video, offline)))
+
+
+@app.command("study")
+def study_playbacks(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder of runs.", callback=existing)
+    ],
+    task: Annotated[str, typer.Option(help="Task whose runs are played.")] = "dmanus-sim2real",
+    speed: Annotated[float, typer.Option(help="Fraction of the simulation's speed.")] = 0.7,
+    boxes: Annotated[int, typer.Option(min=1, help="Objects to try for each run.")] = 100,
+    offline: Offline = False,
+) -> None:
+    """Export and simulate all runs of a task: the paper's real-world check.
+
+    Each playback is written into its run's folder, and the table also as playbacks.json in DIR.
+    """
+    with loading():
+        from pgdm.cli.deploy.study import run_study
+
+    raise typer.Exit(run_study(folder, task, speed, boxes, offline))
+
+
+@app.command("play")
+def play_playback(
+    file: _File,
+    robot: Annotated[
+        str | None, typer.Option(metavar="HOST", help="Address of the arm's control unit.")
+    ] = None,
+    move: Annotated[
+        bool, typer.Option("--move", help="Really move the arm; without it this is a dry run.")
+    ] = False,
+    no_realtime: Annotated[
+        bool, typer.Option("--no-realtime", help="Allow a kernel that is not real-time.")
+    ] = False,
+) -> None:
+    """Play a file on a Franka arm. Without --move nothing moves.
+
+    The arm first goes to the start, slowly. Ctrl-C brings it to rest. The hand is not moved.
+    """
+    if move and robot is None:
+        raise ConfigError("--move needs --robot HOST")
+    with loading():
+        from pgdm.cli.deploy.play import run_play
+
+    raise typer.Exit(run_play(file, robot, move, not no_realtime))

@@ -1,0 +1,64 @@
+"""Policies as commands name them: a run, a checkpoint, a file, or an entry of the zoo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pgdm.cli.options import POLICY_FILES, known_run
+from pgdm.errors import ConfigError
+from pgdm.export import sb3
+from pgdm.export.extras import check_installed
+from pgdm.export.trained import TrainedPolicy, of_run
+from pgdm.zoo import Zoo
+from pgdm.zoo.place import PREFIX
+
+
+@dataclass(frozen=True)
+class PolicyRequest:
+    """Which policy is meant."""
+
+    text: str
+    """A run's folder, a checkpoint in one, a file of ``POLICY_FILES``, or ``zoo:NAME``."""
+    best: bool = False
+    """Whether to take the best checkpoint of a run folder instead of the last."""
+    task: str | None = None
+    """Only ``.zip``: the task that it was trained on."""
+    settings: tuple[str, ...] = ()
+    """Only ``.zip``: settings of the training which differ from the paper's."""
+    vecnormalize: Path | None = None
+    """Only ``.zip``: file of a ``VecNormalize``."""
+    zoo: Zoo | None = None
+    """Only ``zoo:``: which zoo; None: the default."""
+
+
+def open_policy(request: PolicyRequest) -> TrainedPolicy:
+    """Return the policy that is meant.
+
+    Raises:
+        PgdmError: if there is none, or it cannot be read; or if an option does not fit.
+    """
+    if request.text.startswith(PREFIX):
+        if request.best or request.task or request.settings or request.vecnormalize:
+            raise ConfigError("a policy of the zoo takes no --best, --task, --set, --vecnormalize")
+        check_installed("the zoo", "safetensors")
+        from pgdm.zoo.policy import open_entry  # an optional dependency
+
+        return open_entry(request.zoo or Zoo(), request.text.removeprefix(PREFIX))
+    path = Path(request.text)
+    kind = path.suffix.lower() if path.is_file() or path.suffix.lower() in POLICY_FILES else ""
+    is_zip = kind == ".zip"
+    if not is_zip and (request.task or request.settings or request.vecnormalize):
+        raise ConfigError("--task, --set and --vecnormalize are for a zip of Stable-Baselines3")
+    if kind not in POLICY_FILES:
+        return of_run(known_run(path), request.best)
+    if request.best:
+        raise ConfigError("--best is for the folder of a run")
+    if not is_zip:
+        check_installed(str(path), "safetensors")
+        from pgdm.export import tensors  # an optional dependency
+
+        return tensors.read(path)
+    if request.task is None:
+        raise ConfigError(f"'{path}' does not name its task; add --task TASK")
+    return sb3.read(path, request.task, request.settings, request.vecnormalize)

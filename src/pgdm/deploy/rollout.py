@@ -1,0 +1,97 @@
+"""Episodes of a policy with everything that a playback needs of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from pgdm.envs.batch_env import BatchEnv
+from pgdm.errors import RunError
+from pgdm.rl.evaluate import Policy
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One episode."""
+
+    commands: np.ndarray  # (T, nu) targets of the hand's joints at control steps, m and rad
+    qpos: np.ndarray  # (T+1, nq) before each step and after the last
+    object_pos: np.ndarray  # (T+1, 3) m, centre of mass, world frame
+    object_quat: np.ndarray  # (T+1, 4) wxyz
+    dt_s: float
+    metrics: dict[str, float]
+    variation: dict[str, float]
+    """Friction, half-width (m) and mass (kg) of a randomised object."""
+
+
+def roll_out(
+    env: BatchEnv,
+    policy: Policy,
+    generator: torch.Generator | None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+) -> list[Rollout]:
+    """Run one episode in each simulation.
+
+    Args:
+        env: N simulations, ``auto_reset=False``.
+        policy: the policy.
+        generator: stream of the action noise; None: the mean action.
+        progress: called with the steps taken and their number.
+
+    Returns:
+        The episodes that lasted to the end of the motion, the best first: the one whose object
+        stayed closest to its targets.
+
+    Raises:
+        RunError: if none did.
+    """
+    obs, total = env.reset(), len(env.mdp.reference) - 1
+    states, commands = [env.sim.read()], []
+    alive, closest = np.ones(env.num_envs, bool), np.zeros(env.num_envs)
+    metrics: dict[str, torch.Tensor] = {}
+    for step in range(total):
+        progress(step, total)
+        action = policy.act(obs, generator, deterministic=generator is None)
+        commands.append(env.mdp.actions.act(action, env.t).numpy())
+        obs, _, terminated, truncated, info = env.step(action)
+        states.append(env.sim.read())
+        closest += env.object_error().numpy()
+        ended = (terminated | truncated).numpy()
+        if step < total - 1:
+            alive &= ~ended
+        else:  # all end with the motion
+            metrics = info["episodes"].metrics()
+    whole = np.flatnonzero(alive)
+    if not len(whole):
+        raise RunError(
+            f"the policy loses the object before the end of the motion in all {env.num_envs} "
+            "episodes: there is nothing to play; train longer, or roll out more --episodes"
+        )
+    columns = {
+        key: np.stack([getattr(state, key).numpy() for state in states], 1)
+        for key in ("qpos", "object_pos", "object_quat")
+    }
+    targets, dt_s = np.stack(commands, 1), env.sim.control_dt_s
+    return [
+        Rollout(
+            commands=targets[i],
+            qpos=columns["qpos"][i],
+            object_pos=columns["object_pos"][i],
+            object_quat=columns["object_quat"][i],
+            dt_s=dt_s,
+            metrics={name: float(values[i]) for name, values in metrics.items()},
+            variation=_variation(env, i),
+        )
+        for i in whole[np.argsort(closest[whole], kind="stable")]
+    ]
+
+
+def _variation(env: BatchEnv, row: int) -> dict[str, float]:
+    if env.sim.scene.index.randomized_geom is None:
+        return {}
+    friction, half_width, mass = env.sim.variation()
+    drawn = {"friction": friction[row, 0], "half_width_m": half_width[row], "mass_kg": mass[row]}
+    return {name: float(value) for name, value in drawn.items()}

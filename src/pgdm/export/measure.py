@@ -1,0 +1,49 @@
+"""Evaluating a trained policy as its training would."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pgdm.envs.build import EnvBuilder
+from pgdm.experiment import threads
+from pgdm.export.trained import TrainedPolicy
+from pgdm.library.progress import StepProgress
+from pgdm.rl.evaluate import Evaluator
+
+
+def measure(
+    policy: TrainedPolicy,
+    builder: EnvBuilder,
+    progress: StepProgress,
+    stop: Callable[[], bool] = lambda: False,
+    episodes: int | None = None,
+    deterministic: bool = False,
+) -> dict[str, float] | None:
+    """Return a policy's metrics, see `Evaluator.evaluate`; None if it was stopped.
+
+    Args:
+        policy: the policy; its ``cfg.seed`` is that of the noise.
+        builder: its task.
+        progress: called with the control steps done.
+        stop: polled before each step.
+        episodes: of the sampled policy; None: as in the evaluations of its training.
+        deterministic: whether only the deterministic policy matters.
+    """
+    cfg = policy.cfg
+    count, wanted = threads(cfg), episodes or cfg.eval.episodes
+    evaluator = Evaluator(
+        lambda n: builder.make(n, min(n, count), cfg.seed, "eval"),
+        # The evaluator always runs the sampled policy too: once is enough where it is not shown.
+        1 if deterministic else wanted,
+        wanted if cfg.task.randomize else 1,
+        cfg.seed,
+    )
+    steps, most = 0, 2 * (len(builder.mdp.reference) - 1)  # sampled and deterministic
+
+    def stepped() -> bool:
+        nonlocal steps
+        progress("evaluation", steps, most)
+        steps += 1
+        return stop()
+
+    return evaluator.evaluate(policy.network, stepped)

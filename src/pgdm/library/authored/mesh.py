@@ -1,0 +1,280 @@
+"""Reading a user's mesh: repaired if that is safe, otherwise refused."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from pgdm.errors import ConfigError, CorruptAssetError
+
+SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".off")
+"""Supported formats."""
+
+UNITS_M = {"mm": 0.001, "cm": 0.01, "m": 1.0}
+"""Units of meshes, in m."""
+
+SIZES_M = (0.02, 0.6)
+"""Least and largest longest side of an object that a hand can manipulate above the table, m."""
+
+MAX_FACES = 20_000
+"""Largest number of faces: more are not visible, and MuJoCo refuses 200,000."""
+
+_THIN_M = 5e-4  # thinner objects fall through the contact margin
+_OPEN_SHARE = 0.5  # least share of its hull in an open surface, for the hull's volume to be used
+_MAX_BODIES = 50
+_LID_SHARE = 0.15  # largest share of the surface that is filled in
+_READ_ERRORS = (
+    *(ValueError, TypeError, KeyError, IndexError, AttributeError, AssertionError),
+    *(NotImplementedError, ImportError, EOFError, struct.error, OSError, RuntimeError),
+)
+"""What trimesh's readers raise for damaged files."""
+
+
+@dataclass(frozen=True)
+class SoundMesh:
+    """A checked mesh in metres."""
+
+    vertices: np.ndarray = field(repr=False)
+    """(V, 3) m, axes as in the file."""
+    faces: np.ndarray = field(repr=False)
+    """(F, 3) vertex numbers, counter-clockwise seen from outside."""
+    closed: bool
+    """Whether the surface encloses a volume; if not, the hull's volume is used."""
+    volume_m3: float
+    hull_m3: float
+    """Volume of the convex hull."""
+    num_bodies: int
+    """Number of disconnected pieces."""
+    repairs: list[str]
+    """What was changed, one sentence each."""
+
+    def trimesh(self) -> trimesh.Trimesh:
+        """Return it as trimesh's own class."""
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+
+
+def read(path: Path, scale: float = 1.0, allow_open: bool = False) -> SoundMesh:
+    """Read, check and repair a mesh.
+
+    Args:
+        path: STL, OBJ, PLY, GLB or OFF.
+        scale: metres per unit of the file.
+        allow_open: accept a surface that is far from closed, because its mass is known.
+
+    Raises:
+        ConfigError: the size is implausible in this unit; suggests a unit.
+        CorruptAssetError: the file is unreadable, empty, flat, or encloses no volume.
+    """
+    mesh = _load(path)
+    repairs: list[str] = []
+    mesh.apply_scale(scale)
+    _check_size(mesh, path.name, scale)
+    _clean(mesh, path.name, repairs)
+    mesh = _simplified(mesh, repairs)
+    _close(mesh, path.name, repairs, allow_open)
+    return _measured(mesh, path.name, repairs, allow_open)
+
+
+def _load(path: Path) -> trimesh.Trimesh:
+    if path.suffix.lower() not in SUFFIXES:
+        raise ConfigError(
+            f"{path}: format '{path.suffix}' is not supported; valid: {', '.join(SUFFIXES)}"
+        )
+    if not path.is_file():
+        raise ConfigError(f"{path}: there is no such file")
+    try:
+        scene = trimesh.load_scene(path, process=False, skip_materials=True)
+        mesh = scene.to_mesh() if scene.geometry else trimesh.Trimesh()
+    except _READ_ERRORS as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise CorruptAssetError(f"{path}: not a readable mesh ({reason})") from error
+    if not len(mesh.faces):
+        raise CorruptAssetError(f"{path}: has no faces")
+    bad = np.flatnonzero(~np.isfinite(mesh.vertices).all(axis=1))
+    if len(bad):
+        raise CorruptAssetError(
+            f"{path}: {len(bad)} of {len(mesh.vertices)} vertices are NaN or infinite, the first "
+            f"is number {bad[0]}"
+        )
+    return mesh
+
+
+def _check_size(mesh: trimesh.Trimesh, label: str, scale: float) -> None:
+    longest = float(mesh.extents.max())
+    low, high = SIZES_M
+    if low <= longest <= high:
+        return
+    if longest <= 0.0:
+        raise CorruptAssetError(f"{label}: all its vertices are one point")
+    fitting = {u: longest / scale * f for u, f in UNITS_M.items()}
+    fitting = {u: size for u, size in fitting.items() if low <= size <= high}
+    # The largest plausible one: hands manipulate objects of decimetres rather than of centimetres.
+    unit = max(fitting, key=lambda u: fitting[u]) if fitting else None
+    guess = (
+        f"it looks like {unit} ({length(fitting[unit])}): use --unit {unit}"
+        if unit is not None
+        else f"no unit puts that between {length(low)} and {length(high)}: give --scale S, "
+        "the metres per unit of the file"
+    )
+    raise ConfigError(f"{label}: its longest side is {length(longest)}; {guess}")
+
+
+def length(metres: float) -> str:
+    """Return a length as text, such as ``8 cm``."""
+    for unit, factor in (("m", 1.0), ("cm", 0.01), ("mm", 0.001)):
+        if metres >= factor:
+            return f"{metres / factor:.3g} {unit}"
+    return f"{metres / 0.001:.2g} mm"
+
+
+def _clean(mesh: trimesh.Trimesh, label: str, repairs: list[str]) -> None:
+    """Merge equal vertices and remove degenerate and duplicate faces."""
+    before = len(mesh.vertices)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    if merged := before - len(mesh.vertices):
+        repairs.append(f"merged {merged} vertices at the same place")
+    # Relative to the size: by trimesh's own bound the faces of a fine scan are degenerate.
+    sound = mesh.area_faces > 1e-12 * mesh.scale**2
+    if not sound.any():
+        raise CorruptAssetError(f"{label}: none of its {len(sound)} faces has an area")
+    if not sound.all():
+        repairs.append(f"removed {int((~sound).sum())} faces without area")
+        mesh.update_faces(sound)
+    unique = mesh.unique_faces()
+    if not unique.all():
+        repairs.append(f"removed {int((~unique).sum())} duplicate faces")
+        mesh.update_faces(unique)
+    mesh.remove_unreferenced_vertices()
+    thinnest = float(mesh.extents.min())
+    if thinnest < _THIN_M:
+        raise CorruptAssetError(
+            f"{label}: is flat, its shortest side is {length(thinnest)}; an object needs "
+            f"{length(_THIN_M)} or more"
+        )
+
+
+def _simplified(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
+    faces = len(mesh.faces)
+    if faces <= MAX_FACES:
+        return mesh
+    size = mesh.extents.copy()
+    simple = mesh.simplify_quadric_decimation(face_count=MAX_FACES)
+    changed = float(np.abs(simple.extents - size).max())
+    repairs.append(
+        f"simplified {faces:,} faces to {len(simple.faces):,} (its sides changed by "
+        f"{length(changed)} at most)"
+    )
+    return simple
+
+
+def _close(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> None:
+    """Make the winding consistent and outward, and fill holes."""
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+        repairs.append("flipped faces wound against their neighbours")
+    if len(_rims(mesh)):
+        _fill(mesh, label, repairs, allow_open)
+    before = mesh.faces.copy()
+    trimesh.repair.fix_inversion(mesh, multibody=is_closed(mesh))
+    if not np.array_equal(before, mesh.faces):
+        repairs.append("turned the surface inside out: it was wound inward")
+
+
+def _fill(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> None:
+    """Fill holes, unless the lid would turn a bowl into a solid."""
+    share = opening(mesh) / float(mesh.area)
+    if share > _LID_SHARE:
+        if not allow_open:
+            raise CorruptAssetError(
+                f"{label}: its surface is open, a lid would have {share:.0%} of its area, so its "
+                "volume is unknown; close it in your mesh editor, or give --mass KG"
+            )
+        repairs.append(f"left its opening open: a lid would have {share:.0%} of its area")
+        return
+    edges = _rims(mesh)
+    hole = _holes(edges, len(mesh.vertices))
+    count = int(hole.max()) + 1
+    rims = [np.unique(edges[hole == one]) for one in range(count)]
+    middles = [mesh.vertices[rim].mean(axis=0) for rim in rims]  # apex of a fan over each hole
+    fans = np.column_stack((edges[:, ::-1], len(mesh.vertices) + hole))
+    mesh.vertices = np.concatenate((mesh.vertices, middles))
+    mesh.faces = np.concatenate((mesh.faces, fans))
+    holes = "a hole" if count == 1 else f"{count} holes"
+    repairs.append(f"filled {holes} with {len(fans)} faces, {share:.1%} of its area")
+
+
+def is_closed(mesh: trimesh.Trimesh) -> bool:
+    """Return whether a surface encloses a volume: faces traverse each edge equally often each way.
+
+    So an edge along which two closed pieces touch, which has four faces, does not open them.
+    """
+    edges, count = mesh.edges.astype(np.int64), len(mesh.vertices)
+    there, back = edges @ [count, 1], edges @ [1, count]
+    return bool(np.array_equal(np.sort(there), np.sort(back)))
+
+
+def opening(mesh: trimesh.Trimesh) -> float:
+    """Return the total area of flat lids on the holes of a surface, m2.
+
+    The area vector of a closed line is half the sum of a x b over its edges, for any origin.
+    """
+    edges = _rims(mesh)
+    if not len(edges):
+        return 0.0
+    areas = 0.5 * np.cross(mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]])
+    hole = _holes(edges, len(mesh.vertices))
+    sums = np.zeros((int(hole.max()) + 1, 3))
+    np.add.at(sums, hole, areas)
+    return float(np.linalg.norm(sums, axis=1).sum())
+
+
+def _rims(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Return the edges (E, 2) of only one face, in the direction in which it traverses them."""
+    return mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+
+
+def _holes(edges: np.ndarray, num_vertices: int) -> np.ndarray:
+    """Return the number of the hole, from 0, of each edge (E, 2) of the rims."""
+    label = trimesh.graph.connected_component_labels(edges, node_count=num_vertices)
+    return np.unique(label[edges[:, 0]], return_inverse=True)[1]
+
+
+def _measured(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> SoundMesh:
+    bodies = int(mesh.body_count)
+    if bodies > _MAX_BODIES:
+        raise CorruptAssetError(
+            f"{label}: consists of {bodies} pieces, more than the {_MAX_BODIES} allowed: "
+            "join them in your mesh editor"
+        )
+    try:
+        hull = float(mesh.convex_hull.volume)
+    except (ValueError, RuntimeError, IndexError) as error:  # Qhull: all points in one plane
+        raise CorruptAssetError(f"{label}: is flat, it has no convex hull") from error
+    closed, volume = is_closed(mesh), abs(float(mesh.volume))
+    if closed and volume < 1e-4 * hull:
+        raise CorruptAssetError(
+            f"{label}: encloses {1e6 * volume:.3g} cm3, almost nothing compared with the "
+            f"{1e6 * hull:.3g} cm3 of its convex hull"
+        )
+    if not closed:
+        # About its centre: the volume of an open surface depends on the origin.
+        centred = mesh.copy()
+        centred.apply_translation(-mesh.vertices.mean(axis=0))
+        share = abs(float(centred.volume)) / hull
+        if share < _OPEN_SHARE and not allow_open:
+            raise CorruptAssetError(
+                f"{label}: its surface is open and encloses about {share:.0%} of its convex hull, "
+                "so its volume is unknown; close it in your mesh editor, or give --mass KG"
+            )
+        repairs.append(
+            f"its surface is open: its volume is taken as the convex hull's {1e6 * hull:.3g} cm3"
+        )
+        volume = hull
+    if bodies > 1:
+        repairs.append(f"its {bodies} separate pieces are one rigid object")
+    vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    return SoundMesh(vertices, faces, closed, volume, hull, bodies, repairs)

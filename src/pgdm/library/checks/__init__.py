@@ -1,0 +1,1 @@
+"""Checks of models and motions, and comparisons between sources."""

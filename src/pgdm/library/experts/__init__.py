@@ -1,0 +1,1 @@
+"""Expert hand trajectories: read, rebuilt where unpublished, and indexed."""

@@ -1,0 +1,1 @@
+"""The files the library reads and writes, none of which may run code."""

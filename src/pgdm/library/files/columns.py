@@ -1,0 +1,111 @@
+"""Tables of poses: which column is which number, and the order of a quaternion's numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pgdm.errors import ConfigError, CorruptAssetError
+
+POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+"""Columns of a pose, in the order of a table without names."""
+
+_PLACE = r"(?:(?:\w+[./])*(?:p|pos|position|t|trans|translation)[._ ]?)?([xyz])(?:_m| ?\[m\])?"
+_TURN = r"(?:\w+[./])*(?:q|quat|quaternion|r|rot|rotation|orientation)[._ ]?([wxyz])"
+_TIME = r"t|t_s|time|time_s|timestamp|sec|secs|seconds|time ?\[s\]"
+# A start that makes sense only in the other order: upright there, or as modelled.
+_LEVEL_RAD, _UPRIGHT_RAD, _TILTED_RAD = np.deg2rad([3.0, 10.0, 20.0])
+_NEAR_RAD, _FAR_RAD = np.deg2rad([60.0, 120.0])
+
+
+@dataclass(frozen=True)
+class Table:
+    """Poses as a file has them."""
+
+    rows: np.ndarray = field(repr=False)
+    """(N, 7) in the order of `POSE`, unchecked."""
+    times: np.ndarray | None = field(repr=False)
+    """(N,) s, if the file has them."""
+    named: bool
+    """Whether the file says which column is which."""
+    notes: list[str]
+    """What was assumed or left out, one sentence each."""
+
+
+def known(names: Sequence[str]) -> bool:
+    """Return whether any of the names is that of a column of poses."""
+    return any(_meaning(name) for name in names)
+
+
+def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
+    """Return the poses of a table with named columns, in any order.
+
+    Args:
+        rows: (N, C).
+        names: names of the columns, (C,), such as ``qx``, ``quat_x`` or ``pose.orientation.x``.
+        label: the file's name in messages.
+
+    Raises:
+        CorruptAssetError: a column is missing, or there are two of a kind.
+    """
+    if rows.ndim != 2 or rows.shape[1] != len(names):
+        raise CorruptAssetError(
+            f"{label}: rows have shape {rows.shape} for {len(names)} columns: {', '.join(names)}"
+        )
+    meanings = [_meaning(name) for name in names]
+    for wanted in POSE:
+        if meanings.count(wanted) != 1:
+            raise CorruptAssetError(
+                f"{label}: has {meanings.count(wanted)} columns '{wanted}' among "
+                f"{', '.join(names)}; a pose takes {', '.join(POSE)} (m), and optionally time (s)"
+            )
+    times = rows[:, meanings.index("time")] if "time" in meanings else None
+    others = [name for name, meaning in zip(names, meanings, strict=True) if not meaning]
+    notes = [f"left out the columns {', '.join(others)}"] if others else []
+    return Table(rows[:, [meanings.index(name) for name in POSE]], times, True, notes)
+
+
+def by_place(rows: np.ndarray, times: np.ndarray | None = None) -> Table:
+    """Return the poses of a table without names: `POSE`, with the time before them if 8 wide."""
+    if rows.ndim == 2 and rows.shape[1] == 8 and times is None:
+        rows, times = rows[:, 1:], rows[:, 0]
+    note = f"the columns have no names and were read as {' '.join(POSE)}"
+    return Table(rows, times, False, [note])
+
+
+def check_order(quat: np.ndarray, rest: Rotation, label: str, cure: str) -> None:
+    """Refuse an orientation that makes sense only with its numbers in the order x y z w.
+
+    Args:
+        quat: (4,), read as wxyz.
+        rest: how the object rests.
+        label: what it is, in the message.
+        cure: how to name the order.
+
+    Raises:
+        ConfigError: so read it is far from how the object rests, and in the other order it is not.
+    """
+    taken, other = (Rotation.from_quat(quat, scalar_first=f) * rest.inv() for f in (True, False))
+    tilts = [float(np.arccos(np.clip(r.as_matrix()[2, 2], -1, 1))) for r in (taken, other)]
+    tilted = tilts[0] > _TILTED_RAD and tilts[1] < _UPRIGHT_RAD
+    flipped = taken.magnitude() > _FAR_RAD and other.magnitude() < _NEAR_RAD
+    if tilted or (flipped and tilts[0] > tilts[1] - _LEVEL_RAD):
+        raise ConfigError(
+            f"{label}: read as w x y z its orientation is {np.rad2deg(taken.magnitude()):.0f} "
+            f"degrees from how the object rests, as x y z w only "
+            f"{np.rad2deg(other.magnitude()):.0f}; {cure}"
+        )
+
+
+def _meaning(name: str) -> str:
+    text = name.strip().lower()
+    if re.fullmatch(_TIME, text):
+        return "time"
+    if found := re.fullmatch(_TURN, text):
+        return f"q{found[1]}"
+    place = re.fullmatch(_PLACE, text)
+    return place[1] if place else ""

@@ -1,0 +1,112 @@
+"""Expert hand trajectories in the library's form: plain arrays, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pgdm.errors import CorruptAssetError
+from pgdm.library.files import npz
+from pgdm.library.files.motion import numbers
+
+HAND = "adroit"
+"""The robot hand of the trajectories."""
+FINGERS = ("ff", "mf", "lf", "rf", "th")
+"""Order of the fingers in all arrays: fore, middle, little, ring finger, thumb."""
+FINGERTIPS = tuple(f"{finger}distal_point" for finger in FINGERS)
+"""Their points of that hand."""
+
+JOINTS = 30
+"""Joints of Adroit: six of the base, then wrist and fingers."""
+
+HUMAN_JOINTS = 16
+"""Joints of the human hand (MANO): wrist; index, middle, little, ring finger, thumb, three each."""
+
+
+@dataclass(frozen=True)
+class Expert:
+    """Motion of a person's hand along a task's motion; row t belongs to the motion's pose t.
+
+    Lengths in m, angles in rad, world frame of the task's scene.
+    """
+
+    task: str
+    """Task id."""
+    qpos: np.ndarray = field(repr=False)
+    """Adroit's joint positions (T, 30) as published; they may exceed the joints' limits."""
+    human_joints: np.ndarray = field(repr=False)
+    """Joint locations of the human hand (T, 16, 3), MANO order; a finger's last is its DIP."""
+    fingertips: np.ndarray = field(repr=False)
+    """Adroit's fingertips (T, 5, 3) at the joint positions clipped to their limits."""
+    contacts: np.ndarray = field(repr=False)
+    """Points of the object closest to the human fingers (T, 5, 3), in the frame of the object's
+    body (origin of the body, not its centre of mass)."""
+    in_contact: np.ndarray = field(repr=False)
+    """Whether the finger touches the object there (T, 5), bool."""
+    approximate: bool
+    """Whether it was rebuilt from another recording of the same motion, not published."""
+    sha256: str
+    """Hash of its file in the library."""
+
+
+def check(arrays: Mapping[str, Any], label: str) -> dict[str, np.ndarray]:
+    """Check the arrays of an expert trajectory's file and return them, in float64 and bool.
+
+    Args:
+        arrays: arrays of the file.
+        label: the file's name in messages.
+
+    Raises:
+        CorruptAssetError: an array is missing, has a wrong shape or type, or a NaN.
+    """
+    qpos = numbers(arrays, "qpos", label, (None, JOINTS))
+    steps, fingers = len(qpos), len(FINGERS)
+    if steps < 2:
+        raise CorruptAssetError(f"{label}: qpos has {steps} rows, needs 2 or more")
+    return {
+        "qpos": qpos,
+        "human_joints": numbers(arrays, "human_joints", label, (steps, HUMAN_JOINTS, 3)),
+        "fingertips": numbers(arrays, "fingertips", label, (steps, fingers, 3)),
+        "contacts": numbers(arrays, "contacts", label, (steps, fingers, 3)),
+        "in_contact": flags(arrays, "in_contact", label, (steps, fingers)),
+        "approximate": flags(arrays, "approximate", label, ()),
+    }
+
+
+def flags(
+    arrays: Mapping[str, Any], key: str, label: str, shape: tuple[int | None, ...]
+) -> np.ndarray:
+    """Return a bool array of a given shape, where None stands for any length.
+
+    Raises:
+        CorruptAssetError: it is missing, of another shape, or has values other than 0 and 1.
+    """
+    value = numbers(arrays, key, label, shape)
+    if not np.isin(value, (0.0, 1.0)).all():
+        raise CorruptAssetError(f"{label}: '{key}' holds other values than 0 and 1")
+    return value.astype(bool)
+
+
+def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Check and write an expert trajectory; equal arrays always give equal bytes.
+
+    Raises:
+        CorruptAssetError: as for :func:`check`.
+    """
+    npz.write_npz(path, check(arrays, path.name))
+
+
+def read(path: Path, task: str) -> Expert:
+    """Read an expert trajectory.
+
+    Raises:
+        CorruptAssetError: the file is missing, damaged, or holds impossible values.
+    """
+    stored, digest = npz.read_hashed(path)
+    arrays = check(stored, str(path))
+    approximate = bool(arrays.pop("approximate"))
+    return Expert(task=task, approximate=approximate, sha256=digest, **arrays)

@@ -1,0 +1,1 @@
+"""Hands, objects, scenes and motions from the package ``robohive``."""

@@ -1,0 +1,96 @@
+"""Motions of the package ``robohive``, in the library's form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pgdm.errors import CorruptAssetError
+from pgdm.library.files import npz
+from pgdm.library.files.motion import Start, numbers
+
+NO_PLAN = "has no planned start: the package stores no reach plan (use pregrasp=mined)"
+"""Note on every task from the package."""
+
+NOTES = {
+    "wineglass-drink1": (
+        "mined start: five finger joints (MFJ2, RFJ2, LFJ4, LFJ3, LFJ2) differ from TCDM's by up "
+        "to 1.6 rad"
+    ),
+    "wineglass-toast1": (
+        "mined start: the package has none; made from its expert trajectory at the motion's first "
+        "frame, moved out of the glass, within 0.1 rad of TCDM's; motion equal to 3e-13 m"
+    ),
+}
+"""Remaining differences from TCDM by task, apart from the missing plan."""
+
+SKIPPED_FRAMES = {"mug-drink3": 6}
+"""Frames at the beginning of a motion that TCDM's lacks."""
+
+_EXPERT = {"wineglass-toast1": ("Adroit_wineglass_toast_1.npz", 15)}
+"""Motions taken from an expert trajectory: file and first frame."""
+
+EXPERT_FILES = tuple(file for file, _ in _EXPERT.values())
+"""The files of these motions."""
+
+
+def locate(assets: Path, task: str) -> Path | None:
+    """Return the file of a task's motion, None if missing.
+
+    The package omits the number at the end of a name that is unique without it.
+
+    Args:
+        assets: the package's ``envs/tcdm/assets`` folder, unpacked.
+        task: task id.
+    """
+    if task in _EXPERT:
+        path = assets / "tmp_data" / _EXPERT[task][0]
+        return path if path.is_file() else None
+    name, _, motion = task.partition("-")
+    for ending in (motion, motion.rstrip("0123456789")):
+        path = assets / "data" / f"Adroit_{name}_{ending}.npz"
+        if path.is_file():
+            return path
+    return None
+
+
+def read(path: Path, task: str) -> tuple[np.ndarray, np.ndarray, Start]:
+    """Read a motion and its start state as stored.
+
+    Args:
+        path: from :func:`locate`.
+        task: its task id.
+
+    Returns:
+        Positions (T, 3) m, orientations (T, 4) wxyz, mined start.
+
+    Raises:
+        CorruptAssetError: an array is missing, of a wrong shape, or not finite.
+    """
+    arrays, label = npz.read_npz(path), path.name
+    if task in _EXPERT:
+        first = _EXPERT[task][1]
+        position = numbers(arrays, "object_translation", label, (None, 3))
+        rotation = numbers(arrays, "object_orientation", label, (len(position), 4))
+        states = numbers(arrays, "s", label, (len(position), 36))
+        if len(states) <= first:
+            raise CorruptAssetError(f"{label}: has {len(states)} frames, needs more than {first}")
+        return position[first:], rotation[first:], _still(states[first])
+    steps = len(numbers(arrays, "time", label, (None,)))
+    poses = numbers(arrays, "object", label, (None, 7))
+    if steps > len(poses):
+        raise CorruptAssetError(f"{label}: 'time' has {steps} rows, 'object' {len(poses)}")
+    hand = numbers(arrays, "robot_int", label, (30,))
+    object_joints = numbers(arrays, "object_int", label, (6,))
+    poses = poses[SKIPPED_FRAMES.get(task, 0) : steps]
+    return poses[:, :3], poses[:, 3:], _still(np.concatenate((hand, object_joints)))
+
+
+def _still(qpos: np.ndarray) -> Start:
+    return Start(qpos.copy(), np.zeros_like(qpos), None)
+
+
+def notes(task: str) -> list[str]:
+    """Return how a task of the package differs from TCDM's."""
+    return [NO_PLAN, *([NOTES[task]] if task in NOTES else [])]

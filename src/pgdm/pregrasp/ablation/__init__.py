@@ -1,0 +1,1 @@
+"""Ablations of a start state: open hand, mean hand, greater distance."""

@@ -1,0 +1,244 @@
+"""The reach from the reset pose to a pre-grasp, planned on the simulator (paper, App. B).
+
+A cross-entropy search over the waypoints of a path, its timing and its final targets. A plan's cost
+comes from the final state and the object's largest displacement on the way; meshes are not used:
+
+    cost = sum_i e_i + sqrt(mean_j r_j^2) + peak / 5 mm + 0.05 s mean_j |qdot_j| / tol_j
+
+with e_i the errors of :meth:`pgdm.pregrasp.reach.plan.Goal.shares`, each divided by its tolerance,
+r_j the error of joint j divided by its tolerance tol_j, and peak the largest distance by which the
+object was moved. After each round the final targets also move by the error that remains,
+since servos lag behind their targets.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pgdm import seeding
+from pgdm.cem import CemCfg, CrossEntropy
+from pgdm.errors import ConfigError, SceneError
+from pgdm.library.progress import StepProgress, silent
+from pgdm.pregrasp.reach.plan import DEPTH_TOLERANCE_M, OBJECT_TOLERANCE_M, Goal, ReachPlan
+from pgdm.pregrasp.reach.rollout import Ends, Rollouts, to_actions
+from pgdm.pregrasp.reach.waypoints import Waypoints
+from pgdm.pregrasp.sources import reset_pose
+from pgdm.sim.scene import Scene
+
+STEPS, SLOW_STEPS, SLOW_S = 40, 60, 0.3
+"""Control steps of a released plan; the same for bases with slow servos (D'Manus); servo lag [s]
+above which a base counts as slow."""
+
+_END_STD = 0.003, 0.02, 0.03
+"""Standard deviation of the final targets in the first round: slides m, hinges and fingers rad."""
+_END_LIMIT = 5.0  # largest distance of the final targets from the goal, in tolerances
+_SETTLE_GAIN = 0.6  # of the integrator that finds the servos' offsets in the air
+_SHIFT = 0.7  # largest shift of the pose aimed at where servos cannot remove an error (tolerances)
+_SLACK = 0.4  # error that is not corrected, in tolerances
+_SPEED_WEIGHT_S = 0.05  # of the joints' mean final speed, in tolerances per second
+_CHECKED = 4  # candidates of a round that are checked for penetration
+_IMPROVED = 0.9  # a round improves if its best cost is below this share of the best so far
+
+
+@dataclass(frozen=True)
+class ReachCfg:
+    """Settings of the search for a reach."""
+
+    steps: int | None
+    """Control steps of the plan; None takes 40, or 60 for slow base servos (released code)."""
+    hold_steps: int
+    """Control steps at the end of the plan in which the final target stays."""
+    cem: CemCfg
+    """How candidates follow the best ones."""
+    rounds: int
+    """Largest number of rounds."""
+    correction: float
+    """Share of the elites' remaining error that a round adds to the final targets (0..1)."""
+    margin: float
+    """The search stops once every error is below this share of its tolerance (0..1)."""
+    patience: int
+    """It also stops once the plan reaches the pre-grasp and so many rounds have not improved it."""
+
+    def check(self) -> None:
+        """Check that the plan has time to move, and that there are fewer elites than candidates.
+
+        Raises:
+            ConfigError: it does not.
+        """
+        if self.steps is not None and self.steps <= self.hold_steps:
+            raise ConfigError(
+                f"a reach of {self.steps} steps has no time to move while the last "
+                f"{self.hold_steps} hold; give it more steps"
+            )
+        if not 1 <= self.cem.elites < self.cem.population:
+            raise ConfigError(
+                f"a search with {self.cem.elites} elites of {self.cem.population} candidates "
+                "learns nothing; take at least 1, and fewer than candidates"
+            )
+
+
+REACH = ReachCfg(None, 8, CemCfg(48, 8, 0.3, least=0.1), 40, 0.5, 0.6, 2)
+"""The settings used for every task."""
+
+
+def plan_reach(
+    scene: Scene,
+    target_qpos: np.ndarray,
+    substeps: int,
+    cfg: ReachCfg = REACH,
+    seed: int = 0,
+    num_threads: int = 0,
+    progress: StepProgress = silent,
+) -> ReachPlan:
+    """Plan the reach to a pre-grasp, with the objects where the pre-grasp has them.
+
+    Equal arguments give an equal plan, whatever the number of threads.
+
+    Args:
+        scene: scene of the task.
+        target_qpos: whole scene (nq,) with the hand at its pre-grasp.
+        substeps: physics steps per control step.
+        cfg: how to search.
+        seed: seed of the search.
+        num_threads: 0 takes one per core.
+        progress: called before and after each round, with the most rounds as the total.
+
+    Raises:
+        SceneError: the target does not fit the scene, or every simulation diverges.
+        ConfigError: the plan has no time to move, or the search no elites.
+    """
+    began = time.monotonic()
+    search = _Search(scene, np.asarray(target_qpos, float), substeps, cfg, seed, num_threads)
+    rounds = 0
+    progress("reach plan", 0, cfg.rounds)
+    for rounds in range(1, cfg.rounds + 1):
+        done = search.round()
+        progress("reach plan", rounds, cfg.rounds)
+        if done:
+            break
+    return replace(search.best.plan, rounds=rounds, seconds=time.monotonic() - began)
+
+
+def default_steps(scene: Scene) -> int:
+    """Return the length that the released plans have for the scene's hand, in control steps."""
+    model, n = scene.model, scene.index.num_base_joints
+    lag = model.dof_damping[:n] / model.actuator_gainprm[scene.index.actuators[:n], 0]
+    return SLOW_STEPS if n and lag.max() > SLOW_S else STEPS
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A simulated candidate."""
+
+    vector: np.ndarray  # (D,)
+    plan: ReachPlan
+    cost: float
+    worst: float  # largest error, in tolerances
+
+    def beats(self, other: _Candidate | None, margin: float) -> bool:
+        """Return whether this one is better: first by reaching the goal, then margin, then cost."""
+        return other is None or self._rank(margin) < other._rank(margin)
+
+    def _rank(self, margin: float) -> tuple[bool, bool, float]:
+        return not self.plan.reached, self.worst > margin, self.cost
+
+
+class _Search:
+    """State of one search."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        target: np.ndarray,
+        substeps: int,
+        cfg: ReachCfg,
+        seed: int,
+        num_threads: int,
+    ) -> None:
+        cfg.check()
+        self._scene, self._cfg, self._goal = scene, cfg, Goal(scene, target)
+        steps, population = cfg.steps or default_steps(scene), cfg.cem.population
+        home = reset_pose(scene, self._goal.qpos)
+        self._rollouts = Rollouts(scene, home, population, substeps, num_threads)
+        self._alone = self._rollouts.undisturbed(steps)
+        dt = self._rollouts.control_dt_s
+        self._paths = Waypoints(
+            scene, self._goal.joints, self._goal.qpos, steps, cfg.hold_steps, dt
+        )
+        mean, std = self._paths.prior(_END_STD)
+        tolerance, base = self._goal.tolerance, scene.index.num_base_joints
+        above = self._paths.above
+        nearest, farthest = _SLACK * tolerance, _SHIFT * tolerance
+        aim, extra = self._rollouts.settled(above, nearest, farthest, _SETTLE_GAIN)
+        shift, limit = (aim - above)[base:], _END_LIMIT * tolerance
+        mean[self._paths.layout.ends][base:] = shift + extra.clip(-limit, limit)[base:]
+        # Errors that servos cannot remove are not corrected again.
+        self._slack = nearest
+        self._slack[base:] = np.where(shift != 0, farthest[base:], nearest[base:])
+        self._cem = CrossEntropy(mean, std, cfg.cem, seeding.numpy_stream(seed, "reach"))
+        self._best: _Candidate | None = None
+        self._idle = 0
+
+    @property
+    def best(self) -> _Candidate:
+        """The best candidate so far.
+
+        Raises:
+            SceneError: the simulation diverged with every candidate.
+        """
+        if self._best is None:
+            raise SceneError(
+                f"task '{self._scene.task.id}': the simulation diverged with every plan that was "
+                "tried; the pre-grasp may be deep inside something"
+            )
+        return self._best
+
+    def round(self) -> bool:
+        """Try one population; return whether the search is over."""
+        before, cfg = self._best, self._cfg
+        vectors = self._cem.ask()
+        vectors[0] = self._cem.mean
+        if before is not None:
+            vectors[1] = before.vector
+        actions = to_actions(self._scene.index, self._paths.targets(vectors))
+        ends = self._rollouts.run(actions, self._alone)
+        shares = self._goal.shares(ends)
+        cost = self._cost(shares, ends)
+        elites = self._cem.tell(vectors, cost)
+        self._correct(ends.qpos[elites])
+        for row in elites[:_CHECKED].tolist():
+            plan = self._goal.plan(actions[row], ends, row)
+            depth = plan.depth_m / max(plan.target_depth_m, DEPTH_TOLERANCE_M)
+            # Turning is penalised by the cost alone: a sphere may turn on the spot.
+            worst = max(float(shares[row, :-1].max()), depth)
+            one = _Candidate(vectors[row], plan, float(cost[row]), worst)
+            self._best = one if one.beats(self._best, cfg.margin) else self._best
+        best = self.best
+        improved = before is None or best.cost < _IMPROVED * before.cost
+        self._idle = 0 if improved else self._idle + 1
+        return best.worst <= cfg.margin or (best.plan.reached and self._idle >= cfg.patience)
+
+    def _cost(self, shares: np.ndarray, ends: Ends) -> np.ndarray:
+        """Return the cost of plans, (N,), infinite where the simulation diverged."""
+        goal, n = self._goal, len(self._goal.joints)
+        error = (ends.qpos[:, :n] - goal.joints) / goal.tolerance
+        speed = np.abs(ends.qvel[:, :n]) / goal.tolerance
+        cost = shares.sum(1) + np.sqrt((error**2).mean(1)) + ends.peak_m / OBJECT_TOLERANCE_M
+        return np.where(ends.diverged, np.inf, cost + _SPEED_WEIGHT_S * speed.mean(1))
+
+    def _correct(self, qpos: np.ndarray) -> None:
+        """Move the mean of the final targets by the elites' (E, nq) mean error, less the slack."""
+        if not len(qpos):
+            return
+        goal, tolerance = self._goal.joints, self._goal.tolerance
+        error = (goal - qpos[:, : len(goal)]).mean(0)
+        error = np.sign(error) * (np.abs(error) - self._slack).clip(0.0)
+        at, limit = self._paths.layout.ends, _END_LIMIT * tolerance
+        ends = self._cem.mean[at] + self._cfg.correction * error
+        # Anti-windup, as in Rollouts.settled.
+        index = self._scene.index
+        ends = ends.clip(index.joint_low - goal, index.joint_high - goal)
+        self._cem.mean[at] = ends.clip(-limit, limit)

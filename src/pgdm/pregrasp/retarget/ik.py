@@ -1,0 +1,140 @@
+"""Inverse kinematics: poses a scene's hand as a human hand is.
+
+Differential inverse kinematics (:class:`pgdm.pregrasp.retarget.hand_ik.HandIk`) is tried in two
+ways: straight to the targets, then freed from penetration; and from a distance with open fingers,
+with object and table as obstacles. The result of least cost is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from pgdm.library.clearance import FreeingCfg, free_by_search
+from pgdm.pregrasp.hand_geometry import object_to_hand, unit
+from pgdm.pregrasp.retarget.hand_ik import HandIk, IkResult
+from pgdm.pregrasp.retarget.keypoints import Keypoints
+from pgdm.pregrasp.retarget.targets import Targets
+from pgdm.sim.scene import Scene
+
+# Poses tried for freedom: how far the fingertips open and the palm moves off.
+_OPENINGS_M = tuple((opening, lift) for lift in (0.0, 0.01) for opening in (0.006, 0.015, 0.03))
+_FIRST_TRIES = 3  # searches that are always run; more only while none is good enough
+_RETREATS_M = (0.1, 0.06)  # distances from which the hand approaches the object
+_FREEING = FreeingCfg(
+    slide_m=0.01, hinge_rad=0.08, depth_weight=60.0, move_weight=1e-3, negligible_m=1e-9
+)
+"""Weights in m of fingertip error."""
+_FAR_M = 0.01  # scale from which on a point's error counts more than in proportion
+
+
+def solve_hand(
+    scene: Scene | HandIk, keypoints: Keypoints, object_qpos: np.ndarray, *, seed: int = 0
+) -> IkResult:
+    """Return the scene's hand posed as a human hand is, touching nothing if possible.
+
+    Args:
+        scene: scene of the task, or a :class:`HandIk` of it, which saves its set-up.
+        keypoints: the human hand, world frame.
+        object_qpos: joints of all objects (nq - n,); they stay.
+        seed: seed of the search that frees the hand.
+
+    Raises:
+        ConfigError: the hand's points cannot follow a human hand.
+    """
+    ik = scene if isinstance(scene, HandIk) else HandIk(scene)
+    targets = ik.shape.targets(keypoints)
+    begin = ik.approach(object_qpos, targets)
+    straight = ik.result(ik.track(targets, begin), targets)
+    if straight.depth_m == 0.0:
+        return straight
+    poses = [*_opened(ik, targets, straight.qpos), *_from_afar(ik, targets, begin)]
+    # The search takes most of the time: it starts at the best two and the straight pose, and
+    # elsewhere only while none of these is good enough.
+    poses = sorted((ik.result(q, targets) for q in poses), key=lambda r: r.cost)
+    tries = [(one.qpos, seed) for one in (*poses[:2], straight)]
+    tries += [(one.qpos, seed + 1 + i) for i, one in enumerate((*poses[2:5], straight))]
+    found: list[IkResult] = []
+    for i, (qpos, stream) in enumerate(tries):
+        if i >= _FIRST_TRIES and any(r.depth_m == 0 and not len(r.unreached) for r in found):
+            break
+        found.append(_freed(ik, qpos, targets, stream))
+    return min(found, key=lambda result: result.cost)
+
+
+def pushed_out(ik: HandIk, qpos: np.ndarray, targets: Targets, seed: int = 0) -> np.ndarray:
+    """Return joint positions (nq,) near ``qpos`` with the least penetration, ideally none.
+
+    Its cost of leaving the targets is, over the hand's points p with errors e_p and weights w_p
+    relative to the heaviest fingertip,
+
+        sum_p w_p e_p (1 + e_p / 1 cm) / F
+
+    so that no finger pays for all. Equal arguments give an equal result.
+
+    Args:
+        ik: inverse kinematics of the scene.
+        qpos: whole scene (nq,); objects stay.
+        targets: where the hand's points should stay.
+        seed: seed of the search.
+    """
+    if ik.contact.depth(qpos) == 0.0:
+        return qpos
+    model, geoms, tips = ik.scene.model, ik.scene.index.point_geoms, ik.shape.rows[:, 2]
+    data, weights = mujoco.MjData(model), targets.weights / targets.weights[tips].max()
+
+    def away(state: np.ndarray) -> float:
+        data.qpos[:] = state
+        mujoco.mj_kinematics(model, data)
+        error = np.linalg.norm(data.geom_xpos[geoms] - targets.points, axis=1)
+        return float((weights * error * (1.0 + error / _FAR_M)).sum() / len(tips))
+
+    def depth(state: np.ndarray) -> float:
+        return float(ik.contact.depths(state).sum())
+
+    return free_by_search(model, qpos, ik.scene.index.num_joints, depth, _FREEING, away, seed)[0]
+
+
+def _freed(ik: HandIk, qpos: np.ndarray, targets: Targets, seed: int) -> IkResult:
+    """Return a pose freed from penetration, then as near to the targets as obstacles allow."""
+    out = pushed_out(ik, qpos, targets, seed)
+    result = ik.result(out, targets)
+    if result.depth_m > 0.0:
+        return result
+    nearer = ik.result(ik.track(targets, out, steps=60, avoid=True), targets)
+    return min(result, nearer, key=lambda r: r.cost)
+
+
+def _opened(ik: HandIk, targets: Targets, begin: np.ndarray) -> list[np.ndarray]:
+    """Return poses with the fingertips farther apart and the palm farther off; the first free one
+    closed again around the obstacles."""
+    tips = targets.points[ik.shape.rows[:, 2]]
+    outward = tips - tips.mean(axis=0)
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    found = []
+    for opening, lift in _OPENINGS_M:
+        points = targets.points + lift * targets.palm[:, 2]
+        points[ik.shape.rows[:, 1]] += 0.5 * opening * outward
+        points[ik.shape.rows[:, 2]] += opening * outward
+        pose = ik.track(replace(targets, points=points), begin, steps=60)
+        if ik.contact.depth(pose) == 0.0:
+            found.append(ik.track(targets, pose, steps=40, avoid=True))
+            break  # the next ones are only farther off
+        found.append(pose)
+    return found
+
+
+def _from_afar(ik: HandIk, targets: Targets, begin: np.ndarray) -> list[np.ndarray]:
+    """Return the poses of a hand that comes from a distance, around object and table."""
+    away = unit(object_to_hand(ik.scene, begin))
+    found = []
+    for distance in _RETREATS_M:
+        wrist = np.where(np.arange(len(targets.points)) == 0, 1.0, 0.0)
+        points = targets.points + distance * away
+        far = replace(targets, points=points, weights=wrist, palm_weight=1.0)
+        out = ik.track(far, begin, steps=40)
+        if ik.contact.depth(out) == 0.0:
+            found.append(ik.track(targets, out, steps=80, avoid=True))
+    return found

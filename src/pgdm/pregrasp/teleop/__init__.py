@@ -1,0 +1,1 @@
+"""Pre-grasps from tele-operated demonstrations."""

@@ -1,0 +1,119 @@
+"""Which checkpoint of a run is meant, and the policy in it."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+
+from pgdm.errors import CheckpointError, ConfigError
+from pgdm.rl.checkpoint import CheckpointFolder, State, read_checkpoint
+from pgdm.rl.evaluate import policy_of
+from pgdm.rl.trainer import check_state
+from pgdm.runs.files import CHECKPOINTS
+from pgdm.runs.folder import check_links, folder_of, located
+from pgdm.seeding import torch_stream
+
+Array = TypeVar("Array", np.ndarray, torch.Tensor)
+
+
+def find_checkpoint(path: Path, best: bool) -> tuple[Path, Path, State]:
+    """Return the run folder and the checkpoint file that a path means, and the file's contents.
+
+    Args:
+        path: a run's folder, or a checkpoint in one.
+        best: whether to take a run's checkpoint of highest success (then return, with sampled
+            actions), if it has one, instead of its last.
+
+    Raises:
+        RunError: if it is neither.
+        CheckpointError: if the run has no checkpoint yet, or it is damaged.
+    """
+    path = located(path)
+    folder = folder_of(path)
+    check_links(folder)
+    if path.is_file():
+        return folder, path, _checked(path)
+    checkpoints = CheckpointFolder(folder / CHECKPOINTS, keep_last=1)
+    if best and checkpoints.best.is_file():
+        return folder, checkpoints.best, _checked(checkpoints.best)
+
+    def check(state: State) -> None:
+        check_state(state)
+        policy_of(state, path)
+
+    newest = checkpoints.newest(check)
+    if newest is None:
+        raise CheckpointError(f"'{folder}' has no checkpoint yet; pgdm resume {folder} goes on")
+    return folder, *newest
+
+
+def _checked(file: Path) -> State:
+    state = read_checkpoint(file)
+    try:
+        check_state(state)
+    except CheckpointError as error:
+        raise CheckpointError(f"{file}: {error}") from error
+    return state
+
+
+class LoadedPolicy:
+    """The policy of a run, with its statistics of the observations; see `load_policy`."""
+
+    def __init__(self, checkpoint: Path, state: State, seed: int) -> None:
+        self._model = policy_of(state, checkpoint)
+        self._noise = torch_stream(seed, "policy")
+        self.checkpoint = checkpoint
+        """The file it was read from."""
+        self.frames = int(state["frames"])
+        """Length of the training before it, environment steps."""
+        self.obs_dim = self._model.cfg.obs_dim
+        """D, numbers in an observation."""
+        self.action_dim = self._model.cfg.action_dim
+        """A, numbers in an action."""
+
+    def act(self, obs: Array, deterministic: bool = True) -> Array:
+        """Return actions for a batch of observations.
+
+        Args:
+            obs: (N, D), or (D,) for one, as the environment returns them; NumPy or torch.
+            deterministic: return the policy's mean action instead of a sample.
+
+        Returns:
+            Actions (N, A) or (A,) float32, NumPy or torch as ``obs``.
+
+        Raises:
+            ConfigError: if observations have another size: the environment has other settings.
+        """
+        rows = torch.as_tensor(obs, dtype=torch.float32)
+        if rows.ndim not in (1, 2) or rows.shape[-1] != self.obs_dim:
+            raise ConfigError(
+                f"observations have shape {tuple(rows.shape)}, this policy takes (N, "
+                f"{self.obs_dim}); make the environment with the settings of the run"
+            )
+        actions = self._model.act(rows.reshape(-1, self.obs_dim), self._noise, deterministic)
+        found: Any = actions.reshape(*rows.shape[:-1], self.action_dim)
+        return found.numpy() if isinstance(obs, np.ndarray) else found
+
+
+def load_policy(run: str | PathLike[str], *, best: bool = False, seed: int = 0) -> LoadedPolicy:
+    """Return the policy of a run, to act on batches of observations.
+
+    Args:
+        run: a run's folder, or a checkpoint in one.
+        best: whether to take a run's checkpoint of highest success (then return, with sampled
+            actions), if it has one, instead of its last.
+        seed: of the noise of sampled actions.
+
+    Raises:
+        ConfigError: if ``run`` is no path.
+        RunError: if it is neither.
+        CheckpointError: if the run has no checkpoint yet, or it is damaged.
+    """
+    if not isinstance(run, str | PathLike):
+        raise ConfigError(f"run is {run!r:.60}; it must be a run's folder, or a checkpoint in one")
+    _, checkpoint, state = find_checkpoint(Path(run), best)
+    return LoadedPolicy(checkpoint, state, seed)

@@ -1,0 +1,80 @@
+"""One attempt at one job of a sweep, in the process that does the work."""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import logging
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pgdm.errors import SweepError
+from pgdm.runs.folder import RunFolder
+from pgdm.stop import STOPPED
+from pgdm.sweep.ledger import Ledger
+from pgdm.sweep.processes import Process
+from pgdm.sweep.queue import requeue
+from pgdm.sweep.status import run_ending
+
+if TYPE_CHECKING:  # it loads the simulator and torch
+    from pgdm.config.schema import ExperimentCfg
+
+_PR_SET_PDEATHSIG = 1  # Linux, sys/prctl.h
+_HANDOVER_S = 60.0
+"""How long an earlier process of the same job may take to save and exit."""
+
+_log = logging.getLogger(__name__)
+
+Train = Callable[["ExperimentCfg", bool], int]
+"""Trains, ignoring further signals after the first if the flag is set; returns the exit code."""
+
+
+def stop_with_parent() -> None:
+    """Have this process save and stop if its parent dies: nobody would see how it exits."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def attempt(
+    folder: Path, key: str, number: int, threads: int, slurm_id: str | None, train: Train
+) -> int:
+    """Work on a job, and return the exit code of its run.
+
+    Args:
+        folder: folder of the sweep.
+        key: key of the job.
+        number: number of the attempt.
+        threads: number of threads of a job that does not set it itself.
+        slurm_id: Slurm's ID of the job that this process is, if it is one.
+        train: does the run.
+
+    Raises:
+        PgdmError: if the attempt was given up meanwhile, or the run fails.
+    """
+    if not Ledger(folder).register(key, number, Process.of(os.getpid()), slurm_id):
+        raise SweepError("this attempt was given up before it began")
+    from pgdm.sweep.plan import read_job
+
+    job = read_job(folder, key)
+    threads = job.cfg.num_threads or threads
+    cfg = dataclasses.replace(job.cfg, num_threads=threads, resume="auto")
+    return train(cfg, False) if slurm_id is None else _train_in_slurm(cfg, slurm_id, train)
+
+
+def _train_in_slurm(cfg: ExperimentCfg, slurm_id: str, train: Train) -> int:
+    """Do a run; if it is displaced but has made progress, have Slurm start it again."""
+    folder = Path(cfg.run_dir)
+    limit = time.monotonic() + _HANDOVER_S
+    while RunFolder(folder).busy and time.monotonic() < limit:  # on a node that was given up
+        time.sleep(1.0)
+    before = run_ending(folder, cfg.total_frames).frames or 0
+    code = train(cfg, True)
+    if code in STOPPED and (run_ending(folder, cfg.total_frames).frames or 0) > before:
+        try:
+            requeue(slurm_id)
+        except SweepError as error:  # not allowed here: the sweep's own process does it
+            _log.warning("not queued again: %s", error)
+    return code

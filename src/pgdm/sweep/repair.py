@@ -1,0 +1,76 @@
+"""Brings a sweep's ledger, and MLflow with it, in line with the run folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pgdm.errors import ConfigError, RunError, SweepError
+from pgdm.library.progress import Notify
+from pgdm.runs.folder import RunFolder
+from pgdm.sweep.ledger import FINISHED, INTERRUPTED, Ledger
+from pgdm.sweep.mirror import SweepMirror
+from pgdm.sweep.queue import Queue
+from pgdm.sweep.status import PLAN, parent, run_ending, settle
+
+if TYPE_CHECKING:  # it loads the simulator and torch
+    from pgdm.sweep.ledger import Ending
+    from pgdm.sweep.plan import Job, Plan
+
+
+def repaired(folder: Path, queue: Queue | None, notify: Notify) -> Ledger:
+    """Return a sweep's ledger after correcting what killed processes left in it and in MLflow.
+
+    A ledger that is missing or empty is rebuilt from the run folders. While a process drives the
+    sweep, nothing is changed: that process does it.
+
+    Args:
+        folder: folder of the sweep.
+        queue: its jobs in Slurm; None queries Slurm anew.
+        notify: called with a sentence if MLflow fails.
+
+    Raises:
+        SweepError: if the folder holds no sweep, or its files cannot be used.
+    """
+    if not (folder / PLAN).exists():
+        raise SweepError(f"'{folder}' holds no sweep: it has no {PLAN}")
+    ledger = Ledger(folder)
+    if not ledger.entries():
+        from pgdm.sweep.plan import read_plan
+
+        recall(ledger, read_plan(folder))
+    if parent(ledger) is not None:
+        return ledger
+    dead = [entry.run_dir for entry in settle(ledger, queue)]
+    whole = all(state == FINISHED for state in ledger.states().values())
+    SweepMirror.correct_all(ledger.folder, dead, FINISHED if whole else INTERRUPTED, notify)
+    return ledger
+
+
+def recall(ledger: Ledger, plan: Plan) -> None:
+    """Note a plan's jobs in a ledger, and for jobs without attempts what their folders hold."""
+    ledger.add(plan)
+    jobs = {job.key: job for job in plan.jobs}
+    for entry in ledger.entries():
+        job, folder = jobs.get(entry.key), RunFolder(entry.run_dir)
+        if job is None or entry.last is not None or folder.busy or not holds(job):
+            continue
+        ending = job_ending(job)
+        ledger.recall(entry.key, folder.started(), folder.modified(), ending)
+        ledger.set_states({entry.key: ending.state})
+
+
+def job_ending(job: Job) -> Ending:
+    """Return how far a job's run is."""
+    return run_ending(Path(job.cfg.run_dir), job.cfg.total_frames, job.cfg.time_limit_min)
+
+
+def holds(job: Job) -> bool:
+    """Return whether a job's folder holds its run, and not another one."""
+    from pgdm.config.saved import load_config
+    from pgdm.sweep.plan import job_key
+
+    try:
+        return job_key(load_config(job.cfg.run_dir)) == job.key
+    except (RunError, ConfigError):
+        return False  # its worker reports what is wrong
