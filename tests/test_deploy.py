@@ -189,7 +189,7 @@ def test_an_arm_that_rests_carries_the_hand(panda: Path, scene: Scene) -> None:
     rollout = replace(rollout, qpos=np.tile(start, (11, 1)), commands=np.tile(start[:16], (10, 1)))
     facts = {"start_qpos": start.tolist()}
     playback = convert(rollout, scene, ArmIk(panda, setup), setup, ConvertCfg(), facts).playback
-    on_arm = arm_scene(library, cfg.task, cfg.hand, panda, setup)
+    on_arm = arm_scene(library, cfg, panda, setup)
     begin = start_of(playback, on_arm, 16)
     data = mujoco.MjData(on_arm.model)
     data.qpos[:] = begin

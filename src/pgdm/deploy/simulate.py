@@ -9,6 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from pgdm.config.schema import ExperimentCfg
 from pgdm.deploy.arm import Setup
 from pgdm.deploy.limits import JOINTS, POSITION_RAD, TORQUE, smooth
 from pgdm.deploy.playback import Playback, PlaybackError
@@ -17,7 +18,7 @@ from pgdm.library import Library
 from pgdm.library.checks.compiled import compile_tracked
 from pgdm.library.couplings import Couplings
 from pgdm.library.robohive.arms import FLANGE_M
-from pgdm.sim.assembly import load, place, randomized_geom
+from pgdm.sim.assembly import add_objects, load
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.randomize import Randomizer
 from pgdm.sim.scene import HandCfg, Scene, SceneIndex, TaskCfg
@@ -55,10 +56,8 @@ class Outcome:
         return (self.height_m > LIFTED_M).sum(0) * float(self.time_s[1] - self.time_s[0])
 
 
-def arm_scene(
-    library: Library, task: TaskCfg, hand: HandCfg, arm_file: Path, setup: Setup
-) -> Scene:
-    """Compile the scene of a task with the hand at the flange of the arm.
+def arm_scene(library: Library, cfg: ExperimentCfg, arm_file: Path, setup: Setup) -> Scene:
+    """Compile the scene of a run's task with the hand at the flange of the arm.
 
     The arm's joints replace the six base joints. They and the fingers follow position commands; the
     arm carries its own weight and that of the hand, as the maker's controller does.
@@ -67,7 +66,7 @@ def arm_scene(
         SceneError: if a file is damaged, or it does not compile.
         LibraryError: if the library lacks an asset.
     """
-    source = library.source_of(task.motion)
+    task, hand, source = cfg.task, cfg.hand, library.source_of(cfg.task.motion)
     spec = load(library.scene_xml(source))
     spec.option.timestep = _TIMESTEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -91,20 +90,14 @@ def arm_scene(
         frame=flange,
         prefix=f"{hand.name}/",
     )
-    parts = [load(library.object_xml(name, source)) for name in task.objects]
-    for part in parts:
-        spec.attach(part, frame=spec.worldbody.add_frame(), prefix=f"{part.modelname}/")
-    for placement in task.placements:
-        place(spec, placement)
-    drawn = randomized_geom(spec, task) if task.randomize else None
+    folders, drawn = add_objects(spec, library, task, cfg.sim)
     try:
         model = compile_tracked(spec, task.tracked_body)
     except ValueError as error:
         raise SceneError(f"the {_SCENE} of '{task.id}' does not compile: {error}") from error
     geom = None if drawn is None else model.geom(drawn).id
-    prefixes = tuple(f"{part.modelname}/" for part in parts)
     index = _index(model, task, hand, geom)
-    return Scene(model, index, task, hand, library.origins(task.motion, hand.name), prefixes)
+    return Scene(model, index, task, hand, library.origins(task.motion, hand.name), tuple(folders))
 
 
 def _without_base(file: Path, hand: HandCfg) -> mujoco.MjSpec:

@@ -42,18 +42,39 @@ def assemble(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> Ass
     spec.option.timestep = task.timestep_s
     spec.option.iterations = sim.solver_iterations
     spec.option.noslip_iterations = sim.noslip_iterations
-    files = [library.hand_xml(hand.name, source)]
-    files += [library.object_xml(name, source) for name in task.objects]
-    for name, file in zip((None, *task.objects), files, strict=True):
+    file = library.hand_xml(hand.name, source)
+    part = load(file)
+    prefix = f"{part.modelname}/"
+    spec.attach(part, frame=spec.worldbody.add_frame(), prefix=prefix)
+    folders[prefix] = file.parent
+    added, randomized = add_objects(spec, library, task, sim)
+    return Assembly(spec, folders | added, randomized)
+
+
+def add_objects(
+    spec: mujoco.MjSpec, library: Library, task: TaskCfg, sim: SimCfg
+) -> tuple[dict[str, Path], str | None]:
+    """Attach the objects of a task to an uncompiled scene, and place what the task places.
+
+    Returns:
+        Prefix of each object's names -> the folder of its files, and the randomised geom's name.
+
+    Raises:
+        SceneError: if a file is damaged, or a body or geom is missing.
+        LibraryError: if the library lacks an asset.
+    """
+    folders = {}
+    for name in task.objects:
+        file = library.object_xml(name, library.source_of(task.motion))
         part = load(file)
-        if name is not None and sim.object_mass == "published":
+        if sim.object_mass == "published":
             scale_mass(part, RATIOS.get(name, 1.0))
         prefix = f"{part.modelname}/"
         spec.attach(part, frame=spec.worldbody.add_frame(), prefix=prefix)
         folders[prefix] = file.parent
     for placement in task.placements:
         place(spec, placement)
-    return Assembly(spec, folders, randomized_geom(spec, task) if task.randomize else None)
+    return folders, randomized_geom(spec, task) if task.randomize else None
 
 
 def scale_mass(spec: mujoco.MjSpec, ratio: float) -> None:

@@ -64,7 +64,7 @@ def simulated(request: SimulateRequest, progress: StepProgress) -> tuple[Playbac
         arm = ensure_panda(request.offline, notify, progress=progress)
         library = ensure(cfg.task.motion, request.offline, notify, progress=progress)
         progress("compiling the scene", 0, 1)
-        scene = arm_scene(library, cfg.task, cfg.hand, arm, setup)
+        scene = arm_scene(library, cfg, arm, setup)
         start = start_of(playback, scene, len(playback.hand_joints) + cfg.hand.num_base_joints)
     except PlaybackError as error:
         raise PlaybackError(f"{request.file}: {error}") from error
