@@ -101,6 +101,7 @@ def converted(request: ExportRequest, cfg: ConvertCfg, place: Place) -> Converte
         facts = {
             "task": experiment.task.id,
             "hand": experiment.hand.name,
+            "object_mass": experiment.sim.object_mass,
             "checkpoint": Path(trained.name).name,
             "frames": trained.frames,
             "asset_source": builder.scene.asset_source,

@@ -19,7 +19,7 @@ from pgdm.library.arms import ensure_panda
 from pgdm.library.progress import StepProgress
 from pgdm.sim.draw import Shots, draw
 from pgdm.sim.render import write_video
-from pgdm.sim.scene import Scene
+from pgdm.sim.scene import OBJECT_MASSES, Scene
 
 _FPS = 10  # of the film, in real time
 
@@ -59,8 +59,8 @@ def simulated(request: SimulateRequest, progress: StepProgress) -> tuple[Playbac
     """
     playback = read(request.file)
     try:
-        task, hand, setup = _facts(playback)
-        cfg = composed(task, hand, offline=request.offline)
+        task, hand, mass, setup = _facts(playback)
+        cfg = composed(task, hand, f"sim.object_mass={mass}", offline=request.offline)
         arm = ensure_panda(request.offline, notify, progress=progress)
         library = ensure(cfg.task.motion, request.offline, notify, progress=progress)
         progress("compiling the scene", 0, 1)
@@ -73,11 +73,14 @@ def simulated(request: SimulateRequest, progress: StepProgress) -> tuple[Playbac
     return playback, scene, simulate(scene, playback, start, count, request.seed, 0, report)
 
 
-def _facts(playback: Playback) -> tuple[str, str, Setup]:
+def _facts(playback: Playback) -> tuple[str, str, str, Setup]:
     task, hand, stored = (playback.facts.get(key) for key in ("task", "hand", "setup"))
     if not isinstance(task, str) or not isinstance(hand, str) or not isinstance(stored, dict):
         raise PlaybackError("its facts lack task, hand or setup: it cannot be simulated")
     check_task(task)
+    mass = playback.facts.get("object_mass", "volume")
+    if mass not in OBJECT_MASSES:
+        raise PlaybackError(f"its object_mass is not one of {', '.join(OBJECT_MASSES)}")
     try:
         arm_at, height, mount = (stored[k] for k in ("arm_at", "table_height_m", "mount"))
         if len(arm_at) != 3 or len(mount) != 6:
@@ -85,7 +88,7 @@ def _facts(playback: Playback) -> tuple[str, str, Setup]:
         numbers = [tuple(map(float, arm_at)), float(height), tuple(map(float, mount))]
     except (KeyError, TypeError, ValueError) as error:
         raise PlaybackError(f"its setup is not valid ({error})") from error
-    return task, hand, Setup.of(hand, *numbers)
+    return task, hand, mass, Setup.of(hand, *numbers)
 
 
 def _print(outcome: Outcome) -> None:
