@@ -202,8 +202,8 @@ def test_shutdown_stops_the_thread_of_the_physics() -> None:
         def during_step(self) -> None:
             assert running()
 
-        def after_step(self, step: TensorDict) -> None:
-            assert step.batch_size == torch.Size([4])
+        def after_step(self, step: Mapping[str, Any]) -> None:
+            assert step["next"]["reward"].shape == (4, 1)
 
     env, before = PointEnv(4), running()
     learner: Any = Idle()

@@ -108,7 +108,8 @@ class RolloutCollector(BaseCollector):
         finished: list[FinishedEpisodes] = []
         with torch_threads(1):
             steps = range(self.frames_per_batch // self.env.num_envs)
-            by_time: Any = torch.stack([self._step(t, finished) for t in steps])
+            columns = _stacked([self._step(t, finished) for t in steps])
+        by_time = TensorDict(columns, [len(steps), self.env.num_envs], device=self.env.device)
         self._frames += self.frames_per_batch
         self.metrics = _metrics(by_time, finished)
         rollout = by_time.transpose(0, 1)
@@ -117,12 +118,15 @@ class RolloutCollector(BaseCollector):
             self.post_collect_hook(rollout)
         return rollout
 
-    def _step(self, t: int, finished: list[FinishedEpisodes]) -> TensorDict:
-        """Take a control step; return it, [N], and note the episodes that finished in it."""
-        step = TensorDict({"observation": self._obs}, [self.env.num_envs], device=self.env.device)
+    def _step(self, t: int, finished: list[FinishedEpisodes]) -> dict[str, Any]:
+        """Take a control step; return its columns, and note the episodes that finished in it.
+
+        Plain dictionaries: a TensorDict a step costs PPO 2% of its speed.
+        """
+        seen = TensorDict({"observation": self._obs}, [self.env.num_envs], device=self.env.device)
         random = set_exploration_type(ExplorationType.RANDOM)
         with torch.no_grad(), random, drawing_from(self._generator):
-            step = self.policy(step)
+            step: dict[str, Any] = dict(self.policy(seen).items())
         action = step["action"]
         result = self._aside(lambda: self.env.step(action))
         if self._learner is not None:
@@ -140,7 +144,7 @@ class RolloutCollector(BaseCollector):
             "raw_terms": info["raw_terms"],
         }
         if (discount := info.get("discount")) is not None:
-            step["next", "discount"] = discount[:, None]
+            step["next"]["discount"] = discount[:, None]
         if info["episodes"] is not None:
             finished.append(info["episodes"])
         if self._learner is not None:
@@ -194,6 +198,16 @@ class RolloutCollector(BaseCollector):
     ) -> None:
         """Stop the collector's thread, if it has one; simulations need no closing."""
         self._aside.close()
+
+
+def _stacked(steps: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the columns of T steps, each with the steps as its first dimension."""
+    return {
+        name: _stacked([step[name] for step in steps])
+        if isinstance(first, dict)
+        else torch.stack([step[name] for step in steps])
+        for name, first in steps[0].items()
+    }
 
 
 def _metrics(steps: TensorDict, finished: list[FinishedEpisodes]) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
@@ -105,8 +106,8 @@ class Learner(Protocol):
         """Work while the simulations take a step, on what was seen before it."""
         ...
 
-    def after_step(self, step: TensorDict) -> None:
-        """Take in a step [N], with the keys of a rollout: see `RolloutCollector`."""
+    def after_step(self, step: Mapping[str, Any]) -> None:
+        """Take in a step: nested columns (N, ...) with the keys of `RolloutCollector`."""
         ...
 
     def learn(self, rollout: TensorDict) -> dict[str, float]:

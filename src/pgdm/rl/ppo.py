@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -108,7 +108,7 @@ class PPOLearner:
     def during_step(self) -> None:
         """Do nothing: PPO learns between rollouts."""
 
-    def after_step(self, step: TensorDict) -> None:
+    def after_step(self, step: Mapping[str, Any]) -> None:
         """Do nothing: the rollout holds the step."""
 
     def learn(self, rollout: TensorDict) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -171,27 +172,24 @@ class SACLearner:
         for _ in range(self.cfg.updates_per_step):
             self._update()
 
-    def after_step(self, step: TensorDict) -> None:
+    def after_step(self, step: Mapping[str, Any]) -> None:
         """Append a step to the replay, and its observations to their statistics.
 
         Simulations that diverged are left out: what their actions led to is not known.
         """
         self.model.normalizer.update(step["observation"].to(self.model.device))
-        truncated = step["next", "truncated"][:, 0]
-        known: Any = step[~truncated] if truncated.any() else step
-        discount = known.get(("next", "discount"), None)
-        self._replay.append(
-            {
-                "observation": known["observation"],
-                "action": known["action"],
-                "terms": torch.stack(tuple(known["next", "raw_terms"].values()), -1),
-                "discount": torch.ones(len(known), device=known.device)
-                if discount is None
-                else discount[:, 0],
-                "terminated": known["next", "terminated"][:, 0],
-                "next_observation": known["next", "observation"],
-            }
-        )
+        after = step["next"]
+        truncated = after["truncated"][:, 0]
+        known = ~truncated if truncated.any() else slice(None)
+        columns = {
+            "observation": step["observation"],
+            "action": step["action"],
+            "terms": torch.stack(tuple(after["raw_terms"].values()), -1),
+            "discount": after.get("discount", torch.ones_like(after["reward"]))[:, 0],
+            "terminated": after["terminated"][:, 0],
+            "next_observation": after["observation"],
+        }
+        self._replay.append({name: column[known] for name, column in columns.items()})
 
     def learn(self, rollout: TensorDict) -> dict[str, float]:
         """Return the means of what the iteration's updates logged.
