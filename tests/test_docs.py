@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -72,7 +73,9 @@ def _commands() -> list[str]:
 
 @pytest.mark.parametrize("command", _commands())
 def test_settings_in_commands_exist(command: str) -> None:
-    words = [word for word in command.split()[1:] if not word.startswith("-")]
+    bare = re.sub(r"'[^']*'|\"[^\"]*\"", "", command)
+    assert not re.search(r"[()\[\]{}*?]", bare), "quote it: a shell expands or rejects this"
+    words = [word for word in shlex.split(command)[1:] if not word.startswith("-")]
     words = [word for word in words if word != "job"]
     study, typed, written = open_study(words)
     if study is not None or " -m " in command:

@@ -19,7 +19,7 @@ from pgdm.runs.log import RunLog
 from pgdm.sweep.ledger import FILE, Ledger
 from pgdm.sweep.plan import write_plan
 from pgdm.sweep.queue import Queue
-from pgdm.sweep.status import rows, works
+from pgdm.sweep.status import is_alive, rows
 from sweep_plans import plan, start
 
 JOBS, FAULTS = 4, 20
@@ -55,7 +55,7 @@ def metrics(folder: Path, seed: int) -> list[dict[str, str]]:
 
 def kill_workers(folder: Path) -> None:
     for entry in Ledger(folder).entries():
-        if entry.last is not None and works(entry.last, entry.run_dir, Queue()):
+        if entry.last is not None and is_alive(entry.last, entry.run_dir, Queue()):
             entry.last.process.signal(signal.SIGKILL)
 
 

@@ -70,7 +70,7 @@ def _suites() -> list[str]:
         rows.append(f"| `-m task={name}` | {len(suite(name))} | {_cell(describe(file).title)} |")
     note = (
         "With `-m`, `task` takes suites, tasks and patterns, separated by commas; a minus removes "
-        "tasks: `-m task=tcdm30,dhand-*,-dhand-cup`. A suite of your own is "
+        "tasks: `-m 'task=tcdm30,dhand-*,-dhand-cup'`. A suite of your own is "
         "`my/suite/NAME.yaml`, with the key `tasks`, a list of the same words."
     )
     members = [

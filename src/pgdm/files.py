@@ -85,7 +85,7 @@ def read_bytes(path: str | os.PathLike[str], most: int = MOST_BYTES) -> bytes:
     """Return the content of a regular file.
 
     Raises:
-        OSError: as ``open_file``, or if it has more than ``most`` bytes.
+        OSError: as for ``open_file``, or if it has more than ``most`` bytes.
     """
     with open_file(path) as file:
         return whole(file, most)
@@ -95,7 +95,7 @@ def whole(file: io.BufferedReader, most: int = MOST_BYTES) -> bytes:
     """Return the content of an open file.
 
     Raises:
-        OSError: as ``read_bytes``.
+        OSError: as for ``read_bytes``.
     """
     size = os.fstat(file.fileno()).st_size
     content = file.read(most + 1) if size <= most else b""  # it may grow meanwhile
@@ -115,7 +115,7 @@ def read_text(path: str | os.PathLike[str], most: int = MOST_TEXT_BYTES) -> str:
     """Return the content of a UTF-8 file.
 
     Raises:
-        OSError: as ``read_bytes``.
+        OSError: as for ``read_bytes``.
         ValueError: if it is not UTF-8.
     """
     return read_bytes(path, most).decode("utf-8")
@@ -125,8 +125,8 @@ def read_json(path: str | os.PathLike[str], most: int = MOST_JSON_BYTES) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        OSError: as ``read_bytes``.
-        ValueError: as ``parse_json``.
+        OSError: as for ``read_bytes``.
+        ValueError: as for ``parse_json``.
     """
     return parse_json(read_bytes(path, most))
 
@@ -154,8 +154,8 @@ def read_yaml(path: str | os.PathLike[str]) -> Any:
     """Return the content of a YAML file; None if it is empty.
 
     Raises:
-        OSError: as ``read_bytes``.
-        ValueError: as ``parse_yaml``.
+        OSError: as for ``read_bytes``.
+        ValueError: as for ``parse_yaml``.
     """
     return parse_yaml(read_text(path))
 

@@ -31,7 +31,7 @@ from pgdm.pregrasp.sources import is_reset_pose, reset_pose
 from pgdm.sim.scene import Scene, build_scene
 
 _BOUND = {o for task in ("door-open", "hammer-strike") for o in objects_of(task)}
-"""Objects that belong to one task: they are not free, or consist of several bodies."""
+"""Objects that belong to one task: they are attached, or consist of several bodies."""
 
 
 @dataclass(frozen=True)

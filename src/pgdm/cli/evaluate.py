@@ -32,7 +32,9 @@ class EvalRequest:
 
 
 def evaluate_policy(request: EvalRequest) -> int:
-    """Print a policy's metrics and return the exit code: 1 if a stored result is not reproduced.
+    """Print a policy's metrics and return the exit code.
+
+    It is 1 if a stored result is not reproduced, the signal's if one stopped it, otherwise 0.
 
     Raises:
         PgdmError: if the policy is missing, damaged or of another environment.

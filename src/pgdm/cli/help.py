@@ -25,7 +25,7 @@ Examples
   pgdm-run +experiment=fast task=cup-pour1     the same task in 300,000 frames
   pgdm-run task=hammer-use1 total_frames=200_000 run_dir=out/a seed=3
   pgdm-run -m task=duck-lift,cup-pour1 seed=0,1,2     a sweep of six runs
-  pgdm-run -m task=tcdm30,dhand-* --dry-run    what a sweep over suites would do
+  pgdm-run -m 'task=tcdm30,dhand-*' --dry-run  what a sweep over suites would do
   pgdm-run +sweep=validate_tcdm50 budget=smoke a study of the paper, briefly
   pgdm-run task=cup-pour1 --cfg job            print all settings, start nothing
   the same command again, or pgdm resume RUN   resumes a stopped run
@@ -63,7 +63,7 @@ def help_text(config_dir: str | None = None) -> str:
         "  Groups have keys too, such as algo.learning_rate: --cfg job prints them all,",
         "  docs/configuration.md explains each.",
         "",
-        "Suites (-m task=SUITE, or combined: -m task=tcdm30,dhand-*,-dhand-cup)",
+        "Suites (-m task=SUITE, or combined: -m 'task=tcdm30,dhand-*,-dhand-cup')",
         *(_suite(name, file, config_dir, width) for name, file in suites(config_dir).items()),
         "",
         "Sweep files (+sweep=NAME, or a file of yours: +sweep=PATH.yaml)",

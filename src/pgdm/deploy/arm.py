@@ -92,7 +92,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class ArmPath:
-    """Arm joints along a path of the flange, and what they miss of it."""
+    """Arm joints along a path of the flange, and by how much they miss it."""
 
     joints: np.ndarray  # (K, 7) rad
     position_error_m: np.ndarray  # (K,)

@@ -39,7 +39,7 @@ class TrainedPolicy:
     facts: Mapping[str, Any]
     """Sources and hashes of the assets, and versions, at the training; empty if unknown."""
     video: Path
-    """Where a video of it is written."""
+    """Where a video of the policy is written."""
     commands: np.ndarray | None = None
     """Commands of the planned wrist, (T-1, 6) m and rad; None: the run's or the library's own."""
     evaluation: Mapping[str, float] = dataclasses.field(default_factory=dict)

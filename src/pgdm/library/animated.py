@@ -35,7 +35,7 @@ TASKS = tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))
 
 LICENCE = "MIT"
 PLACE = np.array([0.0, 0.0, 0.2])
-"""Position of the object's body at zero joints in the tasks' settings, m."""
+"""Where the tasks' settings place the object's body when its joints are zero, m."""
 
 _FORMAT = 1  # to be increased when the same keyframes give another motion
 
@@ -49,9 +49,9 @@ class AnimatedTask:
     object: str
     animation: Animation
     hand_joints: np.ndarray = field(repr=False)
-    """(nu,) m and rad, the pre-grasp."""
+    """(n,) hand joints, m and rad: the pre-grasp."""
     object_joints: np.ndarray = field(repr=False)
-    """(6,) m and rad, the object at rest."""
+    """(6,) object joints, m and rad: the object at rest."""
 
 
 def read(task: str) -> AnimatedTask:
@@ -90,7 +90,7 @@ def is_current(library: Library) -> bool:
 
 
 def fill(root: Path, library: Library) -> None:
-    """Compile all motions into the library, for a caller who holds its lock.
+    """Compile all motions into the library; the caller must hold its lock.
 
     Args:
         root: the library's folder.

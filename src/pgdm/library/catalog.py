@@ -36,10 +36,11 @@ class Library:
     """The assets under one root and the user's own, as they were when it was opened.
 
     A task takes hand, objects, scene and motion from the one source that serves it, by precedence
-    ``own``, ``checkout``, ``registry``, ``animated``; ``pgdm assets use`` puts one of the middle
-    two first. Exceptions: the user's objects and hands always come from ``own``; other hands, the
-    table and other objects for a motion of ``own`` or ``animated`` come from the first source that
-    has hands. Each motion is read once: its arrays are shared, so copy them before changing any.
+    ``own``, ``checkout``, ``registry``, ``animated``; ``pgdm assets use`` decides which of
+    ``checkout`` and ``registry`` comes first. Exceptions: the user's objects and hands always come
+    from ``own``. For a motion of ``own`` or ``animated``, all other hands and objects and the table
+    come from ``checkout`` or ``registry``, by precedence. Each motion is read once: its arrays are
+    shared, so copy them before changing any.
 
     Args:
         root: the library's folder.
@@ -67,7 +68,7 @@ class Library:
         return Library(self.root, {**self._sources, staging.OWN: grown}, folders)
 
     def serving(self, origins: object) -> Library:
-        """Return this library with some sources before all others.
+        """Return this library with some sources before all others but ``own``.
 
         Args:
             origins: as a run recorded them, such as ``own+checkout``; sources that are missing
@@ -119,7 +120,7 @@ class Library:
     def origins(self, task: str, hand: str) -> str:
         """Return the sources that serve a task with a hand, such as ``own+checkout``.
 
-        The motion's is first, except that ``own`` is also first for a hand of the user's.
+        The motion's source comes first; if the hand is the user's, ``own`` precedes it.
 
         Raises:
             UnknownNameError: the task is not in the library.
@@ -197,7 +198,7 @@ class Library:
         return expert
 
     def files(self) -> Iterator[tuple[str, Path, FileEntry]]:
-        """Yield name (for messages), path and entry of every file in the manifests."""
+        """Yield name (for messages), path and entry of every recorded file, experts included."""
         for source, manifest in self._sources.items():
             for name, entry in manifest.files.items():
                 yield f"{source}/{name}", self._folders[source] / name, entry
@@ -250,20 +251,22 @@ class Library:
         return bool(self._whole())
 
     def _whole(self) -> list[str]:
-        """Return the sources with hands and a table, in order of precedence."""
+        """Return the sources with the benchmark's hands and the table, in order of precedence."""
         return [source for source in self._sources if source not in _PARTIAL]
 
     def _model(
         self, kind: str, name: str, source: str | None, have: dict[str, list[str]], relative: str
     ) -> Path:
         wanted = None if source in _PARTIAL else source
-        return self._existing(self._serving(kind, name, wanted, have), relative)
+        return self._existing(self._first_with(kind, name, wanted, have), relative)
 
     def _source(self, task: str, source: str | None) -> str:
         have = {s: list(m.tasks) for s, m in self._sources.items()}
-        return self._serving("task", task, source, have)
+        return self._first_with("task", task, source, have)
 
-    def _serving(self, kind: str, name: str, source: str | None, have: dict[str, list[str]]) -> str:
+    def _first_with(
+        self, kind: str, name: str, source: str | None, have: dict[str, list[str]]
+    ) -> str:
         if not have:
             raise LibraryError(f"the asset library in {self.root} is empty. {CURE}")
         if source is not None and source not in have:
@@ -307,8 +310,8 @@ def open_library(root: Path | None = None) -> Library:
         root: its folder, by default the one under ``PGDM_HOME``.
 
     Raises:
-        CorruptAssetError: a manifest is damaged, and no other source has hands; otherwise its
-            source is left out with a warning.
+        CorruptAssetError: the manifest of ``checkout`` or ``registry`` is damaged, and neither can
+            be read; any other damaged source is left out with a warning.
     """
     root = paths.library() if root is None else Path(root)
     folders = present(root)
@@ -321,7 +324,7 @@ def open_library(root: Path | None = None) -> Library:
             damaged[source] = error
     for source, error in damaged.items():
         if source in staging.SELF_CONTAINED and not set(found) & set(staging.SELF_CONTAINED):
-            raise error  # nothing else has hands
+            raise error  # nothing else has the benchmark's hands
         _log.warning("%s; continuing without %s", error, _NAMES.get(source, f"source '{source}'"))
     return Library(root, found, folders).serving(staging.preferred(root))
 

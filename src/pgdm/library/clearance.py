@@ -35,7 +35,7 @@ class FreeingCfg:
     population: int = 64
     """Samples per round."""
     patience: int = _ROUNDS
-    """Rounds without a better free pose after which the search stops."""
+    """Once a pose is free: rounds without a better one, after which the search stops."""
     negligible_m: float = 0.0
     """Penetration up to this counts as none."""
 
@@ -59,7 +59,8 @@ def free_by_search(
 
         h(z) = clip(h_0 + s z)        cost(z) = away + depth_weight * depth + move_weight * |z|^2/n
 
-    Of two states the one with less ``depth`` is better, and of equally deep ones the cheaper.
+    The cost guides the search; the result is the sampled state of least ``depth``, among equals the
+    cheapest.
     Following contact normals instead goes astray: the parts of a thin wall push to both sides.
     Equal arguments give an equal result.
 
@@ -69,7 +70,7 @@ def free_by_search(
         num_joints: number of the hand's joints, n.
         depth: penetration of a state (nq,), m.
         cfg: settings of the search.
-        away: cost of a state (nq,) for leaving what it should stay near.
+        away: further cost of a state (nq,), such as the distance of fingertips from their targets.
         seed: seed of the samples.
     """
     low, high = model.jnt_range[:num_joints].T
@@ -101,7 +102,9 @@ def free_by_search(
 
 
 def moved_out(table: Path, hand: Path, thing: Path, qpos: np.ndarray) -> np.ndarray:
-    """Return joint positions (nq,) near ``qpos`` at which the hand touches nothing.
+    """Return joint positions (nq,) near ``qpos`` at which the hand keeps clear of table and object.
+
+    It may touch itself.
 
     Args:
         table: MJCF of the scene.
@@ -132,7 +135,9 @@ def moved_out(table: Path, hand: Path, thing: Path, qpos: np.ndarray) -> np.ndar
 
     found, is_free = free_by_search(model, qpos, joints, depth, LIBRARY_START)
     if not is_free:
-        raise CorruptAssetError(f"{thing.parent.name}: the hand cannot be moved out of the object")
+        raise CorruptAssetError(
+            f"{thing.parent.name}: the hand cannot be freed from object and table"
+        )
     return found
 
 

@@ -143,7 +143,7 @@ def folder_of(root: Path, source: str) -> Path | None:
 
 
 def prefer(root: Path, source: str) -> None:
-    """Have a library source serve every task that it has, before all others."""
+    """Have a library source serve every task that it has, before all others but ``own``."""
     with locked(root), replacing(root / _FIRST) as temp:
         temp.write_text(f"{source}\n", encoding="utf-8")
 

@@ -36,7 +36,7 @@ from pgdm.sim.contact import FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
 CLEARANCE_M = 0.003
-"""Distance that the search keeps; a pose that it returns touches nothing at all."""
+"""Distance that the search keeps; in a pose that it returns the hand touches at most itself."""
 TIP_DISTANCE_M = 0.015
 """Wanted distance of the fingertips from the object."""
 

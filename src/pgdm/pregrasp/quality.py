@@ -34,7 +34,7 @@ class Quality:
     """Measurements of a pre-grasp."""
 
     free: bool
-    """Whether the hand touches nothing."""
+    """Whether the hand touches nothing but itself."""
     depth_m: float
     """Deepest penetration of the hand and anything else."""
     fingertip_distance_m: float

@@ -13,7 +13,8 @@ CONFIG = "config.yaml"
 LOG = "metrics.jsonl"
 RESULT = "result.json"
 LINK = "mlflow.json"
-"""Which MLflow run mirrors this one, and the facts known before there is a result."""
+"""Which MLflow run mirrors this one, and from its start on the values of `pgdm.runs.folder.FACTS`,
+which ``result.json`` has only at the end."""
 LOCK = ".lock"
 """Held by the process that trains in the folder."""
 CHECKPOINTS, VIDEOS = "checkpoints", "videos"
@@ -46,7 +47,7 @@ CONFIG_KINDS: Kinds = {
     "tracking.uri": (*_TEXT, *_NONE),
     "time_limit_min": (*_NUMBER, *_NONE),
 }
-"""Settings that others read of a run."""
+"""Settings in a run's ``config.yaml`` that other code reads, with their types."""
 RESULT_KINDS: Kinds = {
     "status": _TEXT,
     "frames": (int,),

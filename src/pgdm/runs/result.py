@@ -64,7 +64,7 @@ def is_whole(
     Args:
         result: contents of its ``result.json``.
         total_frames: length asked for now.
-        time_limit_min: limit asked for now, None for no limit; 0: the limit the run had.
+        time_limit_min: limit asked for now, None for no limit; 0 keeps the run's own.
     """
     if result.get("status") != "finished":
         return False

@@ -90,11 +90,11 @@ def environment(backend: str) -> dict[str, str]:
     return env | ({"PYOPENGL_PLATFORM": backend} if backend in _LIBRARIES else {})
 
 
-def note_failures(reasons: Mapping[str, str], works: str) -> None:
+def note_failures(reasons: Mapping[str, str], used: str) -> None:
     """Tell the user, once, that a backend was taken in place of the one that MUJOCO_GL names."""
     wanted = os.environ.get(_HIDDEN, os.environ.get("MUJOCO_GL", "")).lower().strip()
     if wanted in reasons:
-        _warn(f"MUJOCO_GL={wanted} does not work here ({reasons[wanted]}); drawing with {works}")
+        _warn(f"MUJOCO_GL={wanted} does not work here ({reasons[wanted]}); drawing with {used}")
 
 
 def no_opengl(reasons: Mapping[str, str]) -> RenderError:

@@ -224,7 +224,7 @@ def bare_scene(model: mujoco.MjSpec, hand: HandCfg) -> Scene:
         hand: its settings.
 
     Raises:
-        SceneError: as :func:`build_scene`.
+        SceneError: as for :func:`build_scene`.
     """
     spec = mujoco.MjSpec.from_string(_BARE)
     spec.attach(model.copy(), frame=spec.worldbody.add_frame(), prefix=f"{hand.name}/")

@@ -31,7 +31,7 @@ from pgdm.sweep.mirror import SweepMirror
 from pgdm.sweep.plan import Job, Plan
 from pgdm.sweep.processes import Process
 from pgdm.sweep.repair import holds, job_ending, recall
-from pgdm.sweep.status import NAME, PARENT, SLOTS, log_path, run_ending, settle, works
+from pgdm.sweep.status import NAME, PARENT, SLOTS, is_alive, log_path, run_ending, settle
 
 _STOP_S = 60.0
 """How long workers may take to save when the sweep itself fails."""
@@ -247,7 +247,7 @@ class Driver:
         """Take over the jobs of a killed driver once the workers that it left have exited."""
         for entry in list(self._left_over):
             assert entry.last is not None
-            if works(entry.last, entry.run_dir, self._launcher.queue):
+            if is_alive(entry.last, entry.run_dir, self._launcher.queue):
                 continue
             self._left_over.remove(entry)
             ending = run_ending(entry.run_dir, entry.total_frames)

@@ -48,7 +48,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Attempt:
-    """One process that worked on a job."""
+    """One process that worked on a job.
+
+    While it runs, it has no end, exit code, frames, metrics or error.
+    """
 
     key: str
     number: int
@@ -58,11 +61,12 @@ class Attempt:
     start: float
     """s since the epoch."""
     end: float | None = None
+    """s since the epoch."""
     exit_code: int | None = None
     frames: int | None = None
-    """Progress of the run at the end, frames."""
+    """Progress of the run at the attempt's end, frames."""
     metrics: Mapping[str, float] | None = None
-    """Its last evaluation."""
+    """The run's last evaluation."""
     error: str | None = None
     slurm_id: str | None = None
     """Slurm's ID of its job, if it is one."""

@@ -164,7 +164,7 @@ def record(plan: Plan) -> None:
     """Write ``plan.json`` with the jobs of a plan added to those that it has already.
 
     Raises:
-        SweepError: as ``check_fits``.
+        SweepError: as for ``check_fits``.
     """
     jobs = {job.key: job for job in (*check_fits(plan), *plan.jobs)}
     write_plan(dataclasses.replace(plan, jobs=tuple(jobs.values())))
@@ -225,7 +225,7 @@ def read_job(folder: Path, key: str) -> Job:
     """Read one job of a sweep's plan by its key.
 
     Raises:
-        SweepError: as ``read_plan``, or if the plan has no such job.
+        SweepError: as for ``read_plan``, or if the plan has no such job.
     """
     folder = folder.absolute()
     with _opened(folder) as whole:

@@ -33,7 +33,7 @@ class Standing:
     """The state of one of Slurm's jobs."""
 
     state: str
-    """Slurm's name of it, such as ``RUNNING``; or ``GONE``, ``UNKNOWN``."""
+    """Slurm's name for the state, such as ``RUNNING``; or ``GONE``, ``UNKNOWN``."""
     status: int = 0
     """Exit status of its process, as ``wait`` returns it."""
     reason: str = ""

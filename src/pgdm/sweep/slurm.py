@@ -51,7 +51,7 @@ def parameters(cfg: SlurmCfg, name: str, at_once: int) -> dict[str, Any]:
     Args:
         cfg: what each job gets.
         name: name of the array in Slurm.
-        at_once: how many of it may run at a time.
+        at_once: how many of the array's jobs may run at a time.
     """
     more = [option.partition("=") for option in cfg.additional_parameters]
     return {

@@ -1,4 +1,8 @@
-"""The state of each job of a sweep, from the ledger and, first of all, from the run folders."""
+"""The state of each job of a sweep.
+
+It is read from the ledger; for an attempt that the ledger calls running, also from the run folder
+or Slurm.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +34,10 @@ from pgdm.sweep.queue import UNKNOWN, Queue
 
 SUCCESS = "eval_sampled/success"
 NAME, PARENT, SLOTS = "name", "parent", "slots"
-"""Facts in the ledger: the sweep's name, the process that drives it, and its jobs at a time."""
+"""Facts in the ledger: the sweep's name, the process that drives it, and how many of its jobs run
+at a time."""
 PLAN, LOGS = "plan.json", "logs"
-"""In the folder of a sweep."""
+"""The plan, and the folder of the logs, in the folder of a sweep."""
 _TAIL_BYTES = 1 << 14  # a dozen lines
 _LONGEST = 150
 _LEFT = (WAITING, RUNNING, INTERRUPTED)
@@ -48,21 +53,24 @@ class Row:
     """Verified: ``running`` only if its process lives, or Slurm runs it."""
     attempts: int
     frames: int
+    """Frames of the run so far; while the job runs, up to its last record."""
     total_frames: int
     success: float | None
-    """Success in the last evaluation, 0..1."""
+    """Sampled success, 0..1: of the last evaluation, or, while the job runs, of the episodes in its
+    last iteration. None if unknown."""
     steps_per_s: float | None
-    """Speed of the last iteration, while it runs."""
+    """Speed of the last iteration; None unless the job runs."""
     frames_per_s: float | None
-    """Speed over the whole run, evaluations included."""
+    """Speed over the whole run so far, evaluations included; None if unknown."""
     left_s: float | None
-    """Remaining time at that pace, while it runs."""
+    """Remaining time at that pace; None unless the job runs."""
     run_dir: Path
     log: Path | None
     """Output of the last attempt."""
     error: str | None
     slurm: str | None
-    """ID and state in Slurm of an attempt that is there, such as ``12_3 PENDING (Resources)``."""
+    """ID and state in Slurm of an attempt that the ledger calls running, such as
+    ``12_3 PENDING (Resources)``; else None."""
 
 
 @dataclass(frozen=True)
@@ -83,17 +91,14 @@ def run_ending(run_dir: Path, total_frames: int, time_limit_min: float | None = 
     Args:
         run_dir: its folder.
         total_frames: length that is wanted now.
-        time_limit_min: limit that is wanted now, None for no limit; 0: the one that it had.
+        time_limit_min: limit that is wanted now, None for no limit; 0 keeps the run's own.
     """
     found = reached(RunFolder(run_dir), total_frames, time_limit_min)
     return Ending(found.status, None, found.frames, found.metrics, found.error)
 
 
-def works(attempt: Attempt, run_dir: Path, queue: Queue) -> bool:
-    """Return whether an attempt runs, as far as this machine can tell.
-
-    An attempt in Slurm's queue counts: it will run.
-    """
+def is_alive(attempt: Attempt, run_dir: Path, queue: Queue) -> bool:
+    """Return whether an attempt runs or is queued in Slurm, as far as this machine can tell."""
     if attempt.state != RUNNING:
         return False
     if attempt.slurm_id is not None:
@@ -104,7 +109,7 @@ def works(attempt: Attempt, run_dir: Path, queue: Queue) -> bool:
 
 
 def parent(ledger: Ledger) -> Process | None:
-    """Return the process that drives the sweep now, or None; it must be on this machine."""
+    """Return the process that drives the sweep now; None also if it is on another machine."""
     known = ledger.fact(PARENT)
     process = Process(*known) if known else None
     return process if process is not None and process.alive else None
@@ -120,7 +125,7 @@ def settle(ledger: Ledger, queue: Queue | None = None) -> list[Entry]:
     queue, closed = queue or Queue(), []
     for entry in ledger.entries():
         last = entry.last
-        if last is None or last.state != RUNNING or works(last, entry.run_dir, queue):
+        if last is None or last.state != RUNNING or is_alive(last, entry.run_dir, queue):
             continue
         ending = run_ending(entry.run_dir, entry.total_frames)
         ledger.end(entry.key, last.number, ending)
@@ -176,7 +181,7 @@ def _row(folder: Path, entry: Entry, queue: Queue) -> Row:
         slurm, pending = _in_slurm(last, entry.run_dir, queue)
         if pending:
             ending = replace(run_ending(entry.run_dir, entry.total_frames), state=WAITING)
-        elif works(last, entry.run_dir, queue):
+        elif is_alive(last, entry.run_dir, queue):
             lines = RunFolder(entry.run_dir).log.tail(_TAIL_BYTES)
             # Evaluations are rare; the episodes of an iteration have sampled actions as well.
             shown = {SUCCESS: _last(lines, "train/success")}

@@ -26,7 +26,7 @@ def chosen(uri: str | None, key: str, notify: Callable[[str], object]) -> str | 
         notify: called with a sentence if the environment's is taken.
 
     Raises:
-        ConfigError: as `absolute`.
+        ConfigError: as for `absolute`.
     """
     if uri:
         return absolute(uri, key)

@@ -47,7 +47,7 @@ METRICS = (
         "mean distance of fingertips from the expert's contact points, where it touches the object",
     ),
     Metric("diverged", "both", "0..1", "share of episodes that ended in a diverged simulation"),
-    Metric("<name>_std", "eval", "as <name>", "standard deviation over the sampled episodes"),
+    Metric("<name>_std", "eval", "as `<name>`", "standard deviation over the sampled episodes"),
     Metric("episodes", "train", "episodes", "episodes that ended in the iteration"),
     Metric(
         "reward",

@@ -59,7 +59,7 @@ def sync(
         root: folder of runs.
         uri: store to fill; None: that of ``MLFLOW_TRACKING_URI``, or ``mlflow.db`` in ``root``.
             What a run's own settings name is not written to: somebody else may have made the run.
-        notify: called after each run; one that cannot be synced keeps no other from it.
+        notify: called after each run; one that cannot be synced does not stop the others.
 
     Raises:
         ConfigError: if ``uri`` or ``MLFLOW_TRACKING_URI`` is no store of MLflow's.

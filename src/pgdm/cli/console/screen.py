@@ -64,13 +64,13 @@ def fits(console: Console, table: Table) -> bool:
 
 
 def notify(text: str) -> None:
-    """Print a note to stderr, such as what takes time or deviates from the request."""
+    """Print a note to stderr, such as that something takes time or deviates from the request."""
     SCREEN.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Show that modules are imported inside, where that takes more than a moment."""
+    """Announce slow imports in the with block: at once on a terminal, else every five seconds."""
     text = "loading torch and MuJoCo"
     with SCREEN.status(text) if SCREEN.is_terminal else _every(_PATIENCE_S, lambda: notify(text)):
         yield
@@ -95,17 +95,17 @@ def _every(interval_s: float, call: Callable[[], object]) -> Iterator[None]:
 
 
 def confirmed(question: str) -> bool:
-    """Return whether the user says yes; without anybody to ask that is a no."""
+    """Return whether the user says yes; Ctrl-C and a missing input mean no."""
     try:
         return typer.confirm(question)
-    except typer.Abort:  # no input
+    except typer.Abort:  # Ctrl-C, or no input
         print()
         return False
 
 
 @contextmanager
 def bars(patience_s: float = 0.0) -> Iterator[StepProgress]:
-    """Show progress: bars with the time left on a terminal, a line every few seconds elsewhere.
+    """Show progress: on a terminal, bars with the remaining time; else a line every few seconds.
 
     Args:
         patience_s: time before the bars appear.
@@ -155,7 +155,7 @@ class _Amount(ProgressColumn):
 
 
 class _Rows:
-    """StepProgress as a row of rich for each kind of step, which is the step's first word."""
+    """A StepProgress that shows a row for each kind of step; the kind is the step's first word."""
 
     def __init__(self, bars: Bars, start_s: float) -> None:
         self._bars, self._start_s = bars, start_s

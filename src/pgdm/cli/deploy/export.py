@@ -78,7 +78,7 @@ def converted(request: ExportRequest, cfg: ConvertCfg, place: Place) -> Converte
     """Roll the policy of a run out and convert its best episode.
 
     Raises:
-        PgdmError: as `run_export`.
+        PgdmError: as for `run_export`.
     """
     cfg.check()
     trained = of_run(request.run, request.best)

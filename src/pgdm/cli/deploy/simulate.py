@@ -55,7 +55,7 @@ def simulated(request: SimulateRequest, progress: StepProgress) -> tuple[Playbac
     """Play a playback open-loop; return it, the scene and what became of the objects.
 
     Raises:
-        PgdmError: as `run_simulate`.
+        PgdmError: as for `run_simulate`.
     """
     playback = read(request.file)
     try:

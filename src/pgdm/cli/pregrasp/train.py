@@ -58,8 +58,9 @@ def _describe(predictor: Predictor, poses: int) -> list[str]:
     lines = [
         f"hand {predictor.hand}: {poses} pre-grasps of {objects} objects"
         + (f", without {', '.join(predictor.left_out)}" if predictor.left_out else ""),
-        f"on objects held out in turn the fingertips are {1e3 * predictor.error_m:.1f} mm off on "
-        f"average, the mean hand's {1e3 * predictor.mean_hand_error_m:.1f} mm",
+        "with each object held out in turn, predicted fingertips are "
+        f"{1e3 * predictor.error_m:.1f} mm off on average; those of the mean hand, "
+        f"{1e3 * predictor.mean_hand_error_m:.1f} mm",
     ]
     if objects < _FEW_OBJECTS:
         lines.append(
@@ -76,35 +77,38 @@ def _collect(hand: str, progress: StepProgress) -> list[tuple[Scene, Example]]:
         LibraryError: there is none.
     """
     library, tasks = open_library(), available("task")
-    if library.is_filled:  # so that the tasks that come with pgdm are there
-        library = ensure(animated.TASKS[0], True, notify)
+    if library.is_filled:
+        library = ensure(animated.TASKS[0], True, notify)  # compiles pgdm's own motions
     found: list[tuple[Scene, Example]] = []
     for task in counted("scenes", tasks, progress):
         cfg = compose([f"task={task}"])
         if cfg.task.motion not in library.tasks():
             continue
-        is_own_hand = cfg.hand.name == hand
-        if not is_own_hand:
+        is_task_hand = cfg.hand.name == hand
+        if not is_task_hand:
             if not pregrasp_file.own(task, hand):
                 continue
             cfg = compose([f"task={task}", f"hand={hand}"])
-        poses = list(_poses(library, cfg, is_own_hand))
+        poses = list(_poses(library, cfg, is_task_hand))
         if not poses:
             continue
         scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
         if not scene.lies_free:
-            notify(f"{task}: left out, its object is not free")
+            notify(f"{task}: left out, its object, like a door, cannot move in all six directions")
             continue
         shown = [start.qpos for start in poses if not is_reset_pose(scene, start.qpos)]
         found += [(scene, one) for qpos in shown if (one := example(scene, qpos)) is not None]
     if not found:
-        raise LibraryError(f"the library has no pre-grasp of hand '{hand}'. {CURE}")
+        raise LibraryError(
+            f"there is no pre-grasp of hand '{hand}' to learn from. Label or retarget some; a "
+            f"filled library has those of the benchmark's hands. {CURE}"
+        )
     return found
 
 
-def _poses(library: Library, cfg: ExperimentCfg, is_own_hand: bool) -> Iterator[Start]:
+def _poses(library: Library, cfg: ExperimentCfg, is_task_hand: bool) -> Iterator[Start]:
     starts = library.motion(cfg.task.motion).starts
-    if is_own_hand and "mined" in starts:
+    if is_task_hand and "mined" in starts:
         yield starts["mined"]
     for source in _OWN:
         own = pregrasp_file.find(cfg.task.id, cfg.hand.name, source)

@@ -21,7 +21,7 @@ def explain(library: Library, task: str) -> Iterator[str]:
 
     Raises:
         UnknownNameError: the task is not in the library.
-        CorruptAssetError: a file of it is damaged.
+        CorruptAssetError: a file of the task is damaged.
     """
     serving = library.source_of(task)
     entry = library.entry(task)

@@ -120,7 +120,7 @@ def _add_motions(
 
 
 def _cleared(target: Path, task: str, start: Start) -> Start:
-    """Move the hand of an expert trajectory out of the object: a pre-grasp has no contact."""
+    """Free the hand of an expert trajectory from object and table: a pre-grasp has no contact."""
     qpos = clearance.moved_out(
         target / "scene" / "table.xml",
         target / "hands" / "adroit" / "hand.xml",

@@ -98,7 +98,7 @@ class Ablated:
         return self.retreat_m + FINGER_LENGTH_M * self.finger_error_rad
 
     def facts(self) -> dict[str, str]:
-        """Return what a run records of it."""
+        """Return what a run records about its ablation."""
         return {
             "ablation_distance_mm": f"{1e3 * self.distance_m:.1f}",
             "ablation_retreat_mm": f"{1e3 * self.retreat_m:.1f}",

@@ -42,7 +42,7 @@ class Metrics:
 
     @property
     def free(self) -> bool:
-        """Whether the hand touches nothing."""
+        """Whether the hand touches nothing but itself."""
         return not self.touches
 
     @property

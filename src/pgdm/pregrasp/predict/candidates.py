@@ -25,7 +25,7 @@ _FREEING = FreeingCfg(0.01, 0.08, depth_weight=1e3, population=48, patience=6)
 
 @dataclass(frozen=True)
 class Candidate:
-    """A predicted pre-grasp that touches nothing."""
+    """A predicted pre-grasp in which the hand touches nothing but itself."""
 
     qpos: np.ndarray = field(repr=False)
     """Whole scene (nq,)."""
@@ -111,9 +111,10 @@ def free_ones(
 
 
 def freed(scene: Scene, qpos: np.ndarray, seed: int = 0) -> np.ndarray | None:
-    """Return a state (nq,) near ``qpos`` in which the hand touches nothing, or None if not found.
+    """Return a state (nq,) near ``qpos`` in which the hand is free, or None if not found.
 
-    Objects stay, joints keep their limits, and equal arguments give an equal result.
+    It keeps clear of everything but itself. Objects stay, joints keep their limits, and equal
+    arguments give an equal result.
     """
     model, contact, start = scene.model, HandContact(scene), qpos.copy()
     count = scene.index.num_joints

@@ -1,9 +1,10 @@
 """A hand's pose relative to an object as a grasp vector, and back to joints.
 
-The grasp vector of a hand with J joints after its base, (9 + J,), along the axes of the world:
+The grasp vector of a hand with J joints after its base is (9 + J,); position and rotation are in
+world axes:
 
 - position of an anchor of the palm relative to the object's centre of mass, m (3); the predictor's
-  anchor is the middle of the fingertips averaged over its examples
+  anchor is the mean over its examples of the fingertips' midpoint, in the palm's frame
 - first two columns of the palm's rotation (6), a representation without discontinuities (Zhou et
   al., "On the Continuity of Rotation Representations in Neural Networks", CVPR 2019)
 - joints after the base, rad (J)
@@ -68,7 +69,7 @@ class GraspFrame:
         """Return the scene's state (nq,) with the hand at a grasp vector.
 
         If the base would exceed its limits, base and wrist joints take the pose within them that
-        brings fingertips and palm nearest in least squares; the fingers stay.
+        brings fingertips and palm nearest to the vector's, in least squares; the fingers stay.
 
         Args:
             vector: (9+J,).
@@ -102,7 +103,10 @@ class GraspFrame:
         return asked
 
     def _base_joints(self, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """Return base joint positions (6,), not clipped: the solution nearer to the limits."""
+        """Return base joint positions (6,), not clipped.
+
+        Of the two Euler solutions it is the one that exceeds the limits less.
+        """
         slides, hinges = base_joints(self.scene, position, rotation)
         hinges = np.remainder(hinges + np.pi, 2 * np.pi) - np.pi
         low, high = self._low[3:6], self._high[3:6]
