@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+import sysconfig
 import tarfile
 import tomllib
 import zipfile
@@ -166,11 +167,15 @@ def test_an_installed_wheel_works_outside_the_repository(
 ) -> None:
     environment, elsewhere = tmp_path / "venv", tmp_path / "elsewhere"
     elsewhere.mkdir()
-    _run(sys.executable, "-m", "venv", environment, cwd=elsewhere)
+    _run(sys.executable, "-m", "venv", "--without-pip", environment, cwd=elsewhere)
     programs = environment / "bin"
-    constraints = REPOSITORY / "constraints.txt"
-    _run(programs / "pip", "install", "--quiet", "-c", constraints, built[1], cwd=elsewhere)
-    _run(programs / "pip", "check", cwd=elsewhere)
+    # Its dependencies are taken from here, but not pgdm itself: a path in a .pth file does not add
+    # the editable packages found there. `make run`, in tests/test_readme.py, installs them.
+    (packages,) = (environment / "lib").glob("python*/site-packages")
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
+    pip = (programs / "python", "-m", "pip")
+    _run(*pip, "install", "--quiet", "--no-deps", built[1], cwd=elsewhere)
+    _run(*pip, "check", cwd=elsewhere)
     assert "pgdm-run" in _run(programs / "pgdm-run", "--help", cwd=elsewhere)
     assert "assets" in _run(programs / "pgdm", "--help", cwd=elsewhere)
     package = "import hydra, pgdm.conf; print(pgdm.conf.__file__)"

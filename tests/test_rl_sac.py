@@ -148,10 +148,10 @@ def build(env: PointEnv, cfg: SACCfg) -> SACLearner:
 
 def one_step(
     env: PointEnv, near: float = -1.0, terminated: bool = False, obs: Tensor | None = None
-) -> TensorDict:
+) -> dict[str, Any]:
     """Return a step of all simulations with a given reward before weighting."""
     n = env.num_envs
-    step = {
+    return {
         "observation": torch.zeros(n, D) if obs is None else obs,
         "action": torch.zeros(n, A),
         "next": {
@@ -161,7 +161,6 @@ def one_step(
             "raw_terms": {"near": torch.full((n,), near)},
         },
     }
-    return TensorDict(step, [n])
 
 
 def constant(learner: SACLearner, critics: list[float], targets: list[float]) -> None:
@@ -270,7 +269,7 @@ def test_truncated_steps_are_not_learned_from() -> None:
     env = PointEnv()
     learner = build(env, SHORT)
     step = one_step(env)
-    step["next", "truncated"][2] = True
+    step["next"]["truncated"][2] = True
     learner.after_step(step)
     assert len(learner._replay) == env.num_envs - 1
 
@@ -279,8 +278,8 @@ def test_observations_after_a_termination_are_not_used() -> None:
     env = PointEnv()
     learner = build(env, replace(SHORT, warmup_steps=1))
     step = one_step(env)
-    step["next", "terminated"][:] = True
-    step["next", "observation"][:] = math.nan
+    step["next"]["terminated"][:] = True
+    step["next"]["observation"][:] = math.nan
     learner.after_step(step)
     learner.during_step()  # raises if it is used
 

@@ -181,11 +181,12 @@ class SACLearner:
         after = step["next"]
         truncated = after["truncated"][:, 0]
         known = ~truncated if truncated.any() else slice(None)
+        ones = torch.ones(len(truncated), device=truncated.device)
         columns = {
             "observation": step["observation"],
             "action": step["action"],
             "terms": torch.stack(tuple(after["raw_terms"].values()), -1),
-            "discount": after.get("discount", torch.ones_like(after["reward"]))[:, 0],
+            "discount": after["discount"][:, 0] if "discount" in after else ones,
             "terminated": after["terminated"][:, 0],
             "next_observation": after["observation"],
         }
