@@ -148,7 +148,7 @@ def study_playbacks(
         Path, typer.Argument(metavar="DIR", help="Folder of runs.", callback=existing)
     ],
     task: Annotated[str, typer.Option(help="Task whose runs are played.")] = "dmanus-sim2real",
-    speed: Annotated[float, typer.Option(help="Fraction of the simulation's speed.")] = 0.7,
+    speed: Annotated[float, typer.Option(help="Fraction of the simulation's speed.")] = 0.6,
     boxes: Annotated[int, typer.Option(min=1, help="Objects to try for each run.")] = 100,
     offline: Offline = False,
 ) -> None:
