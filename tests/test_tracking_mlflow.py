@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from pgdm.runs.config_file import as_text, dotted
 from pgdm.runs.files import LINK, read_json
 from pgdm.runs.folder import RunFolder
 from pgdm.tracking import NullTracker, Tracker, TrackingCfg, metric_names, open_tracker
+from pgdm.tracking.live import MlflowTracker
 from pgdm.tracking.mlflow import Mirror, Store, find_run, store_uri
 from pgdm.tracking.thin import MAX_POINTS, Thin, points
 
@@ -237,6 +239,19 @@ def test_store_out_of_reach_warns_once_and_harms_nobody(
     assert uri in messages[0] and "training continues" in messages[0]
     assert "pgdm runs sync" in messages[1]
     assert "\n" not in "".join(messages)
+
+
+def test_a_store_that_hangs_does_not_hold_up_the_end(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, released = make(tmp_path / "runs" / "a"), threading.Event()
+    with caplog.at_level(logging.WARNING, "pgdm"):
+        tracker = MlflowTracker(CFG, folder, FACTS)
+        tracker._pool.submit(released.wait)  # as a call that gets no answer
+        tracker.finish("finished", patience_s=0.1)
+    released.set()
+    (message,) = [r.getMessage() for r in caplog.records if r.name.startswith("pgdm")]
+    assert "pgdm runs sync" in message
 
 
 def test_store_that_was_locked_gets_all_of_it_later(

@@ -75,7 +75,7 @@ class MlflowTracker(Tracker):
         last = self._pool.submit(self._end, status)
         wait([last], patience_s)
         self._pool.shutdown(wait=False, cancel_futures=True)
-        if not last.done() or last.exception() is not None:
+        if last.cancelled() or not last.done() or last.exception() is not None:
             _log.warning("MLflow lacks the last records of this run; `%s` adds them", self._cure)
 
     def _send(self) -> None:
