@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -67,6 +68,8 @@ def test_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "htp://lab")
     monkeypatch.setenv("MUJOCO_GL", "disable")
     monkeypatch.setattr(doctor, "free_bytes", lambda: 1_000_000_000)
+    monkeypatch.setitem(sys.modules, "warp", None)  # as if it were not installed
+    monkeypatch.delitem(sys.modules, "pgdm.sim.warp", raising=False)
     outcome = command("pgdm", "doctor")
     text = " ".join(outcome.out.split())
     assert outcome.code == 1
@@ -74,4 +77,5 @@ def test_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert "MLflow has no stores of the kind 'htp'" in text and "unset MLFLOW_TRACKING_URI" in text
     assert "rendering is switched off by MUJOCO_GL=disable; unset it to render" in text
     assert "empty; runs fetch what they need" in text
+    assert "sim=warp needs MuJoCo Warp" in text
     assert outcome.out.count("PROBLEM") == 2

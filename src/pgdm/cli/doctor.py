@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import sys
@@ -90,7 +91,7 @@ def _machine() -> Iterator[Check]:
     else:
         yield Check("GPU", None, "torch finds none; device=cpu needs none")
     try:
-        pass
+        importlib.import_module("pgdm.sim.warp")
     except PgdmError as error:
         yield Check("MuJoCo Warp", None, str(error))
     else:
