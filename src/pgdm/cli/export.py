@@ -18,12 +18,7 @@ from pgdm.library.progress import StepProgress
 from pgdm.stop import StopRequest
 
 _ENDINGS = {"torchscript": ".pt", "onnx": ".onnx", "safetensors": ".safetensors"}
-_PACKAGES = {
-    "torchscript": (),
-    "onnx": ("onnx", "onnxscript"),
-    "safetensors": ("safetensors",),
-    "minari": ("minari",),
-}
+_PACKAGES = {"onnx": ("onnx", "onnxscript"), "minari": ("minari",)}
 
 
 @dataclass(frozen=True)
@@ -55,7 +50,7 @@ def export(request: ExportRequest) -> int:
         PgdmError: if the policy cannot be read, its task not be compiled, or the file not be
             written.
     """
-    check_installed(f"--format {request.form}", *_PACKAGES[request.form])
+    check_installed(f"--format {request.form}", *_PACKAGES.get(request.form, ()))
     policy = open_policy(request.policy)
     cfg = policy.cfg
     policy = replace(policy, cfg=replace(cfg, offline=request.offline or cfg.offline))

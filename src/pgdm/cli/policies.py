@@ -7,11 +7,11 @@ from pathlib import Path
 
 from pgdm.cli.options import POLICY_FILES, known_run
 from pgdm.errors import ConfigError
-from pgdm.export import sb3
-from pgdm.export.extras import check_installed
+from pgdm.export import sb3, tensors
 from pgdm.export.trained import TrainedPolicy, of_run
 from pgdm.zoo import Zoo
 from pgdm.zoo.place import PREFIX
+from pgdm.zoo.policy import open_entry
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,6 @@ def open_policy(request: PolicyRequest) -> TrainedPolicy:
     if request.text.startswith(PREFIX):
         if request.best or request.task or request.settings or request.vecnormalize:
             raise ConfigError("a policy of the zoo takes no --best, --task, --set, --vecnormalize")
-        check_installed("the zoo", "safetensors")
-        from pgdm.zoo.policy import open_entry  # an optional dependency
-
         return open_entry(request.zoo or Zoo(), request.text.removeprefix(PREFIX))
     path = Path(request.text)
     kind = path.suffix.lower() if path.is_file() or path.suffix.lower() in POLICY_FILES else ""
@@ -55,9 +52,6 @@ def open_policy(request: PolicyRequest) -> TrainedPolicy:
     if request.best:
         raise ConfigError("--best is for the folder of a run")
     if not is_zip:
-        check_installed(str(path), "safetensors")
-        from pgdm.export import tensors  # an optional dependency
-
         return tensors.read(path)
     if request.task is None:
         raise ConfigError(f"'{path}' does not name its task; add --task TASK")

@@ -67,10 +67,8 @@ def show(name: Name, place: Place = None) -> None:
     """Print settings, result, hashes and provenance of a policy, as YAML."""
     import yaml
 
-    from pgdm.export.extras import check_installed
     from pgdm.zoo import Zoo
 
-    check_installed("the zoo", "safetensors")
     with loading():
         from pgdm.export.tensors import about
 
