@@ -6,7 +6,7 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,14 +101,16 @@ def _expert_home(checkout: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def library_home() -> Path:
+def library_home() -> Iterator[Path]:
     """Set ``PGDM_HOME`` to a folder with all tasks, and return it.
 
     It is shared by all tests: copy it before changing anything.
     """
     if CHECKOUT is None:
         pytest.skip("needs a TCDM checkout: name one with PGDM_TCDM_ROOT")
-    return _filled_home(CHECKOUT)
+    home = _filled_home(CHECKOUT)
+    yield home
+    assert [p.name for p in home.iterdir()] == ["library"], "a test fetched into the shared library"
 
 
 @pytest.fixture(scope="session")

@@ -7,16 +7,19 @@ from pathlib import Path
 
 import pytest
 
+from conftest import DOWNLOADS, fetched_wheel
 from pgdm.cli.main import main
 from pgdm.cli.run import main as train
 from pgdm.deploy.playback import read
+from pgdm.library.robohive.fill import PACKAGE
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("library_home")
 def test_a_run_is_exported_simulated_and_studied(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    own_library: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    fetched_wheel(PACKAGE)  # has the arm
+    (own_library.parent / "downloads").symlink_to(DOWNLOADS)
     run, file = tmp_path / "lift", tmp_path / "lift.npz"
     short = "total_frames=4096 eval.episodes=2 eval.video=false tracking=none budget=smoke"
     wrist = "action=residual action.wrist_path=planned action.hold_steps=3 action.carry_load=true"
