@@ -52,8 +52,9 @@ def check_assets(
     """
     for difference in builder.differences(recorded):
         raise RunError(
-            f"{where} was trained with {difference}; restore the library (pgdm assets list), or "
-            "start anew in another run_dir"
+            f"{where} was trained with {difference}; restore the library ('pgdm assets list' shows "
+            "it, 'pgdm assets fetch' adds registry, 'pgdm assets import PATH' checkout), or start "
+            "anew in another run_dir"
         )
     before, now = recorded.get("versions", {}), versions()
     for package in ("mujoco", "torch"):
