@@ -34,6 +34,7 @@ def test_a_run_is_exported_simulated_and_studied(
     assert main([*export, "--speed", "0.4"]) == 0
     assert main(["deploy", "check", str(file)]) == 0
     facts = read(file).facts
+    assert facts["object_mass"] == "volume"
     assert facts["task"] == "dmanus-sim2real" and 0.1 <= facts["variation"]["mass_kg"] <= 0.45
     capsys.readouterr()
     assert main(["deploy", "simulate", str(file), "--boxes", "3"]) == 0

@@ -121,7 +121,7 @@ class RolloutCollector(BaseCollector):
     def _step(self, t: int, finished: list[FinishedEpisodes]) -> dict[str, Any]:
         """Take a control step; return its columns, and note the episodes that finished in it.
 
-        Plain dictionaries: a TensorDict a step costs PPO 2% of its speed.
+        Plain dictionaries: a TensorDict a step cost PPO 3% of its speed.
         """
         seen = TensorDict({"observation": self._obs}, [self.env.num_envs], device=self.env.device)
         random = set_exploration_type(ExplorationType.RANDOM)
