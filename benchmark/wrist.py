@@ -21,11 +21,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from pgdm.config.compose import compose
+from pgdm.config.schema import ExperimentCfg
 from pgdm.config.suites import suite
 from pgdm.envs.build import EnvBuilder
 from pgdm.experiment import assets, env_builder
 from pgdm.motion.reference import ObjectReference
+from pgdm.rl.evaluate import run_episodes
+from pgdm.rl.networks import SquashedCfg, SquashedPolicy
 from pgdm.runs.files import read_json, write_json
+from pgdm.seeding import torch_stream
 from pgdm.sim.scene import SceneIndex
 from pgdm.wrist.path import SLIDES, GraspPoint, base_orientation, clipped_path, feasible_path
 from pgdm.wrist.plan import WristPlan
@@ -52,8 +56,30 @@ def measure(task: str) -> dict[str, Any]:
         "planned": reached(unheld.wrist),
         "held": reached(builder.wrist),
         "hold_steps": cfg.action.hold_steps,
+        "untrained": {
+            "carried": untrained(compose([f"task={task}", "action=residual"])),
+            "planned": untrained(cfg),
+        },
         "paper_success": cfg.task.paper_success,
     }
+
+
+def untrained(cfg: ExperimentCfg) -> float:
+    """Return the mean return of 25 episodes of the untrained policy of `algo=sac`, seed 0."""
+    builder, sac = env_builder(cfg, assets(cfg, print), print), compose(["algo=sac"]).algo
+    evaluation = builder.make(25, stream="eval_sampled")
+    network = SquashedCfg(
+        kind="squashed",
+        obs_dim=evaluation.obs_dim,
+        action_dim=evaluation.action_dim,
+        hidden=list(sac.hidden),
+        log_std_init=sac.log_std_init,
+        observation_clip=sac.observation_clip,
+    )
+    policy = SquashedPolicy(network, torch_stream(0, "weights"), evaluation.warm_start())
+    results = run_episodes(evaluation, policy, torch_stream(0, "eval"))
+    assert results is not None
+    return round(float(results["return"].mean()), 1)
 
 
 def geometry(builder: EnvBuilder) -> dict[str, float]:
@@ -100,15 +126,16 @@ def table(stored: dict[str, Any]) -> str:
     """Return the stored results as a Markdown table, lowest `planned` rigid grasp first."""
     lines = [
         "| task | steps | `clipped`, `feasible`: mean [mm] | `planned`: mean, largest [mm] "
-        "| rigid grasp | with the hold | paper |",
-        "|---|--:|--:|--:|--:|--:|--:|",
+        "| rigid grasp | with the hold | paper | untrained return: `carried`, `planned` |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for task, row in sorted(stored.items(), key=lambda item: item[1]["planned"]["bound"]):
         free, paper = row["planned"], row["paper_success"]
         lines.append(
             f"| {task} | {row['steps']} | {row['clipped_mm']}, {row['feasible_mm']} "
             f"| {free['mean_mm']}, {free['max_mm']} | {free['bound']:.1%} "
-            f"| {row['held']['bound']:.1%} | {'' if paper is None else f'{paper:.1%}'} |"
+            f"| {row['held']['bound']:.1%} | {'' if paper is None else f'{paper:.1%}'} "
+            f"| {row['untrained']['carried']:.0f}, {row['untrained']['planned']:.0f} |"
         )
     return "\n".join(lines)
 

@@ -76,7 +76,7 @@ def run(request: HandRequest) -> None:
     print(f"hand:     {made.folder / 'hand.xml'}")
     print(f"settings: {made.settings}")
     _draw(made)
-    print(f"next:     pgdm-run task=hammer-use1 hand={made.name} action=residual algo=ppo_fast")
+    print(f"next:     pgdm-run +experiment=fast task=hammer-use1 hand={made.name}")
 
 
 def _found(made: AuthoredHand) -> list[tuple[str, str]]:

@@ -53,7 +53,7 @@ def run(request: TaskRequest, offline: bool) -> None:
             f"reach:   the pre-grasp is not reached ({'; '.join(made.plan.failures)}): episodes "
             "start at the pose itself"
         )
-    print(f"next:    pgdm-run task={made.id} action=residual algo=ppo_fast")
+    print(f"next:    pgdm-run +experiment=fast task={made.id}")
 
 
 def _with_hands(offline: bool, progress: StepProgress) -> Library:

@@ -99,9 +99,10 @@ def _collect(hand: str, progress: StepProgress) -> list[tuple[Scene, Example]]:
         shown = [start.qpos for start in poses if not is_reset_pose(scene, start.qpos)]
         found += [(scene, one) for qpos in shown if (one := example(scene, qpos)) is not None]
     if not found:
+        fill = "" if library.is_own_hand(hand) else f" (a filled library has some). {CURE}"
         raise LibraryError(
-            f"there is no pre-grasp of hand '{hand}' to learn from. Label or retarget some; a "
-            f"filled library has those of the benchmark's hands. {CURE}"
+            f"there is no pre-grasp of hand '{hand}' to learn from. Make some with 'pgdm pregrasp "
+            f"label' or 'pgdm pregrasp mocap'{fill}"
         )
     return found
 
