@@ -9,7 +9,7 @@ class Metric(NamedTuple):
     """One metric."""
 
     name: str
-    """Without its group."""
+    """Name without its group."""
     groups: str
     """``train``, ``eval`` or ``both``."""
     unit: str
