@@ -108,7 +108,7 @@ class Composer:
         check_early(dotted(settings), self._divided(overrides)[0].flat)
 
     def _divided(self, overrides: Sequence[str]) -> tuple[_Choice, list[Override]]:
-        """Divide overrides: return the settings for the chosen options, and the overrides of keys."""
+        """Return the settings for the options that overrides choose, and the overrides of keys."""
         check_overrides(overrides)
         for text in overrides:
             if text not in self._parsed:
@@ -214,7 +214,7 @@ def checked(plain: Mapping[str, Any]) -> ExperimentCfg:
     Raises:
         ConfigError: if a key is unknown or missing, or a value is wrong.
     """
-    # Imported late, since the schema loads the simulator and torch: wrong names are reported sooner.
+    # Imported late: the schema loads the simulator and torch, and wrong names are reported before.
     from pgdm.config.identity import default_run_dir
     from pgdm.config.schema import ExperimentCfg, check_device
 

@@ -22,7 +22,7 @@ _REFUSED = {
     "hydra.searchpath": "give the folder with --config-dir",
     "sweep.most_jobs": "type it after pgdm-run",
 }
-"""Keys that are refused although Hydra or pgdm would obey them, and the reason given to the user."""
+"""Keys that Hydra or pgdm would obey but that are refused, and the reason given to the user."""
 _TYPED = ("hydra.searchpath", "sweep.most_jobs")
 """Those of them that a user may type on the command line."""
 _HANDLING = {"handlers", "formatters", "filters", "loggers"}
@@ -123,7 +123,7 @@ def check_method(settings: Mapping[str, Any], where: str) -> None:
 
 
 def trust_method(settings: Mapping[str, Any]) -> None:
-    """Trust the module of the settings' method: in this process, its children and later commands."""
+    """Trust the module of a method: in this process, in those it starts and in later commands."""
     if (module := _module(settings)) is None or module in _trusted():
         return
     os.environ[TRUSTED] = ",".join(sorted(_trusted() | {module}))

@@ -181,7 +181,7 @@ class Loader:
 
 @contextmanager
 def _composing() -> Iterator[None]:
-    """Lock Hydra's global state, and skip the largest part of its work, which is not needed here."""
+    """Lock Hydra's global state, and skip the largest part of its work, not needed here."""
     with _LOCK:
         version.setbase(_VERSION_BASE)
         before = _defaults._create_interpolation_map
@@ -193,7 +193,7 @@ def _composing() -> Iterator[None]:
 
 
 def _only_if_read(build: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap Hydra's builder of the map for references in a defaults list: build it only if needed."""
+    """Wrap the builder of Hydra's map of references in a defaults list to skip unused maps."""
 
     def build_if_read(overrides: Any, defaults_list: list[Any], self_added: bool) -> Any:
         read = any(not entry.is_self() and entry.is_interpolation() for entry in defaults_list)

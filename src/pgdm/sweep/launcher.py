@@ -74,5 +74,5 @@ class Launcher(Protocol):
         ...
 
     def end(self, patience_s: float) -> None:
-        """Stop all workers unless ``stays``; kill those that remain after ``patience_s`` seconds."""
+        """Stop all workers unless ``stays``; kill those that still run after ``patience_s``."""
         ...

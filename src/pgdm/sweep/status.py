@@ -91,7 +91,7 @@ def run_ending(run_dir: Path, total_frames: int, time_limit_min: float | None = 
     Args:
         run_dir: its folder.
         total_frames: length that is wanted now, frames.
-        time_limit_min: limit that is wanted now; None for no limit, 0 for that stored in the run.
+        time_limit_min: limit that is wanted now; None: no limit, 0: the one that ended the run.
     """
     found = reached(RunFolder(run_dir), total_frames, time_limit_min)
     return Ending(found.status, None, found.frames, found.metrics, found.error)
