@@ -32,7 +32,7 @@ class Description:
     title: str
     """The comment at its top."""
     defaults: dict[str, str]
-    """Its defaults list: group to option; the option of a plain file is empty."""
+    """Its defaults list: group to option; an entry that is a file maps to an empty string."""
     keys: list[Key]
     """Its keys, in order."""
 

@@ -37,7 +37,7 @@ def explain(
 
     Args:
         error: what Hydra, OmegaConf or the YAML reader raised.
-        overrides: what the user gave.
+        overrides: the user's overrides.
         config_dir: the user's own settings folder.
         keys: lists the keys that are valid with given overrides, to suggest the nearest.
     """

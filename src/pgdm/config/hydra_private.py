@@ -1,4 +1,4 @@
-"""All that pgdm uses of Hydra's private interfaces; no other module imports ``hydra._internal``.
+"""Everything pgdm uses of Hydra's private interfaces; only this module imports ``hydra._internal``.
 
 Hydra's public functions compose one set of overrides at a time and reread every file, which is too
 slow for a sweep of thousands of runs.

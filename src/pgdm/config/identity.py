@@ -13,7 +13,7 @@ from pgdm.errors import RunError
 from pgdm.paths import inside
 from pgdm.runs.config_file import dotted
 
-if TYPE_CHECKING:  # it loads the simulator and torch
+if TYPE_CHECKING:  # the schema loads the simulator and torch
     from pgdm.config.schema import ExperimentCfg
 
 # Keys that change where, when and how a run is done or displayed, but not what it computes.
@@ -26,7 +26,7 @@ _BESIDE = (
     "num_threads",  # simulations do not depend on it
     "device",  # a run may move between machines
     "time_limit_min",
-    "total_frames",  # a longer run begins with the shorter one
+    "total_frames",  # a longer run can resume a shorter one
     "tracking",
     "checkpoint",
     "eval.interval_frames",

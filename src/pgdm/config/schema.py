@@ -29,7 +29,7 @@ from pgdm.tracking import TRACKERS, TrackingCfg
 
 @dataclass(frozen=True)
 class ExperimentCfg:
-    """All settings of one run; created only by ``pgdm.config.compose``."""
+    """All settings of one run, composed by ``pgdm.config.compose`` or read from a file."""
 
     task: TaskCfg
     """The object and the motion it follows."""
@@ -52,11 +52,11 @@ class ExperimentCfg:
     algo: Annotated[AlgoCfg, ChosenBy("learner", algo_class, tuple(ALGOS))]
     """The learner and its settings."""
     sim: SimCfg
-    """Solver settings."""
+    """Physics engine, solver and object masses."""
     eval: EvalCfg
     """How and how often the policy is evaluated."""
     checkpoint: CheckpointCfg
-    """How often the run is saved."""
+    """How often the run is saved, and how many checkpoints are kept."""
     tracking: TrackingCfg
     """Where the run is mirrored."""
     seed: int
@@ -74,7 +74,8 @@ class ExperimentCfg:
     run_dir: str
     """Folder of the run."""
     resume: str
-    """``auto`` resumes a run that exists, ``must`` requires one, ``never`` refuses it."""
+    """Whether an existing run is resumed: ``auto`` if there is one; ``must`` fails without one,
+    ``never`` fails with one."""
     budget: str
     """Label for reports, such as smoke, reduced or paper."""
     keep_replay: bool

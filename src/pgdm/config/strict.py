@@ -67,7 +67,7 @@ def build(cls: type[T], data: object, path: str = "") -> T:
             union of one of these and None.
         data: a mapping with exactly its fields. A whole number is a valid float, and a float
             without a fraction (1e6) a valid int; nothing else is converted.
-        path: dotted key under which the data are found in all settings, for the messages.
+        path: dotted key of the data within all settings, for the messages.
 
     Raises:
         ConfigError: if a key is missing or unknown, or a value has the wrong type.

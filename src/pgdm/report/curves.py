@@ -184,7 +184,7 @@ def mean_curve(runs: Sequence[Run], metric: str) -> tuple[Array, Array, Array]:
 
 
 def mean_line(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
-    """Return the same for pairs of frames and values, which are interpolated linearly."""
+    """Return the same for curves, each a pair of frames and values to interpolate linearly."""
     last = min(frames[-1] for frames, _ in lines)
     every = np.unique(np.concatenate([frames for frames, _ in lines]))
     every = every[every <= last]

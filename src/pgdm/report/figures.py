@@ -98,7 +98,7 @@ def bars(rows: Sequence[Average]) -> Figure:
 
 
 def shades(rows: Sequence[Average]) -> dict[Setting, RGBA]:
-    """Return the rows' colours: the hue depends on the name, and is pale without pre-grasps.
+    """Return the rows' colours: a hue for each name, pale without pre-grasps.
 
     All groups share one legend, so a name has the same hue in every group.
     """

@@ -66,7 +66,7 @@ def compared(results: Results, rows: Sequence[Average]) -> Figure | None:
 
 
 def apart(results: Results, rows: Sequence[Average]) -> set[str]:
-    """Return the groups without a figure, because their rows share no task."""
+    """Return the groups that have no panel because their rows share no task."""
     return {
         group
         for group, own in by_group(rows).items()

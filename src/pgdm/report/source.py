@@ -92,7 +92,7 @@ def _planned(root: Path, found: Found) -> Iterator[RunFolder]:
                 continue
             config = job["config"] if isinstance(job, dict) else None
             if not isinstance(config, dict) or fault(config, {**CONFIG_KINDS, "run_dir": (str,)}):
-                found.unreadable[str(file)] = "it is damaged; the sweep's command plans it anew"
+                found.unreadable[str(file)] = "it is damaged; the sweep's command writes it again"
                 continue
             folder = RunFolder(file.parent / config.get("run_dir", ""))
             if not (folder.path / CONFIG).exists():

@@ -69,7 +69,7 @@ class LoadedPolicy:
         self._model = policy_of(state, checkpoint)
         self._noise = torch_stream(seed, "policy")
         self.checkpoint = checkpoint
-        """The file it was read from."""
+        """The file from which the policy was read."""
         self.frames = int(state["frames"])
         """Length of the training up to the checkpoint, frames."""
         self.obs_dim = self._model.cfg.obs_dim

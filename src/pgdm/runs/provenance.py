@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pgdm.errors import RunError
 
-if TYPE_CHECKING:  # they load the simulator and torch
+if TYPE_CHECKING:  # these load the simulator and torch
     from pgdm.envs.build import EnvBuilder
     from pgdm.library.progress import Notify
 

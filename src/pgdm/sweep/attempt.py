@@ -20,7 +20,7 @@ from pgdm.sweep.processes import Process
 from pgdm.sweep.queue import requeue
 from pgdm.sweep.status import run_ending
 
-if TYPE_CHECKING:  # it loads the simulator and torch
+if TYPE_CHECKING:  # the schema loads the simulator and torch
     from pgdm.config.schema import ExperimentCfg
 
 _PR_SET_PDEATHSIG = 1  # Linux, sys/prctl.h
@@ -30,7 +30,7 @@ _HANDOVER_S = 60.0
 _log = logging.getLogger(__name__)
 
 Train = Callable[["ExperimentCfg", bool], int]
-"""Trains and returns the exit code; the flag says whether to ignore stop signals but the first."""
+"""Trains with given settings, ignoring further stop signals if flagged; returns the exit code."""
 
 
 def stop_with_parent() -> None:
@@ -68,7 +68,7 @@ def _train_in_slurm(cfg: ExperimentCfg, slurm_id: str, train: Train) -> int:
     """Train; if Slurm stops the run early but it has made progress, have Slurm requeue it."""
     folder = Path(cfg.run_dir)
     limit = time.monotonic() + _HANDOVER_S
-    while RunFolder(folder).busy and time.monotonic() < limit:  # an earlier process
+    while RunFolder(folder).busy and time.monotonic() < limit:  # an earlier process is saving
         time.sleep(1.0)
     before = run_ending(folder, cfg.total_frames).frames or 0
     code = train(cfg, True)

@@ -86,7 +86,7 @@ class LocalLauncher:
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=subprocess.STDOUT,
-                    start_new_session=True,  # Ctrl-C reaches only the driver, which asks workers
+                    start_new_session=True,  # Ctrl-C reaches only the driver, which stops workers
                 )
 
     def adopt(self, assignment: Assignment, attempt: Attempt) -> bool:

@@ -51,7 +51,8 @@ class LocalCfg:
     max_jobs: int
     """Most jobs at a time; 0: as many as cores and memory allow."""
     cores_per_job: int
-    """Threads of a job that leaves ``num_threads`` at 0; 0: what ``sweep.local.room`` returns."""
+    """Threads of a job that leaves ``num_threads`` at 0; 0: as many as the largest ``num_threads``
+    of the other jobs or, if all are 0, the cores divided by the jobs at a time."""
     memory_per_job_gb: float
     """Memory to allow for each job [GB]."""
 
@@ -71,7 +72,7 @@ class SlurmCfg:
     constraint: str | None
     """Features that nodes must have; None: any node."""
     time_min: int
-    """Time limit of a Slurm job, which saves when it is reached, and is requeued [min]."""
+    """Time limit of a Slurm job, which saves shortly before it and is requeued [min]."""
     cores_per_job: int
     """Cores, and threads, of each job."""
     memory_per_job_gb: float
@@ -120,7 +121,7 @@ def read_launcher(choice: str, settings: object) -> LauncherCfg:
     if not isinstance(cfg, LocalCfg) and cfg.signal_delay_s >= 60 * cfg.time_min:
         raise ConfigError(
             f"hydra.launcher.signal_delay_s is {cfg.signal_delay_s}, but the time limit "
-            f"time_min only {cfg.time_min} minutes; choose a longer time limit"
+            f"time_min is only {cfg.time_min} minutes; choose a longer time limit"
         )
     return cfg
 
@@ -155,7 +156,7 @@ class Plan:
 
 def job_key(cfg: ExperimentCfg) -> str:
     """Return 16 hex digits, equal for two experiments that have the same result."""
-    # The identity omits total_frames so that a longer run can resume a shorter one.
+    # An identity omits total_frames, so that a longer run can resume a shorter one; a key has it.
     whole = identity(cfg) | {"total_frames": cfg.total_frames}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -242,7 +243,9 @@ def _opened(folder: Path) -> Iterator[dict[str, Any]]:
     try:
         whole = files.read_json(file)
         if whole["format"] != FORMAT:
-            raise SweepError(f"{file} has the format of another pgdm; choose another sweep.name")
+            raise SweepError(
+                f"{file} has the format of another pgdm version; choose another sweep.name"
+            )
         yield whole
     except FileNotFoundError as error:
         raise SweepError(f"'{folder}' holds no sweep: it has no {PLAN}") from error
@@ -250,10 +253,12 @@ def _opened(folder: Path) -> Iterator[dict[str, Any]]:
         raise SweepError(f"cannot read {file}: {files.reason(error)}") from error
     except ConfigError as error:
         raise SweepError(
-            f"{file} was written by a pgdm with other settings ({error}); choose another sweep.name"
+            f"{file} does not fit the settings of this pgdm ({error}); choose another sweep.name"
         ) from error
     except (ValueError, LookupError, TypeError) as error:
-        raise SweepError(f"{file} is damaged ({error}); remove it to plan anew") from error
+        raise SweepError(
+            f"{file} is damaged ({error}); remove it, and plan the sweep again"
+        ) from error
 
 
 def _job(entry: Mapping[str, Any], folder: Path) -> Job:

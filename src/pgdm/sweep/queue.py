@@ -17,6 +17,7 @@ _ENDED = (
     *("BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY"),
     *("PREEMPTED", "REVOKED", "TIMEOUT", GONE),
 )
+# Beginnings of the reasons for which Slurm never starts a pending job.
 _STUCK = (
     *("accountnotallowed", "badconstraints", "dependencyneversatisfied", "invalidaccount"),
     *("invalidqos", "jobholdmaxrequeue", "launch failed", "partitionnodelimit"),

@@ -13,7 +13,7 @@ from pgdm.sweep.mirror import SweepMirror
 from pgdm.sweep.queue import Queue
 from pgdm.sweep.status import PLAN, parent, run_ending, settle
 
-if TYPE_CHECKING:  # it loads the simulator and torch
+if TYPE_CHECKING:  # these load the simulator and torch
     from pgdm.sweep.ledger import Ending
     from pgdm.sweep.plan import Job, Plan
 
@@ -73,4 +73,4 @@ def holds(job: Job) -> bool:
     try:
         return job_key(load_config(job.cfg.run_dir)) == job.key
     except (RunError, ConfigError):
-        return False  # its worker reports what is wrong
+        return False  # the job's worker reports what is wrong

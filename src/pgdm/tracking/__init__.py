@@ -45,7 +45,7 @@ def located(cfg: TrackingCfg, notify: Callable[[str], object]) -> TrackingCfg:
     """Return a configuration with the absolute address of the store that the user names, if any.
 
     Args:
-        cfg: as the user wrote it.
+        cfg: configuration as the user wrote it.
         notify: called with a sentence if the store is that of ``MLFLOW_TRACKING_URI``.
 
     Raises:

@@ -21,7 +21,7 @@ def chosen(uri: str | None, key: str, notify: Callable[[str], object]) -> str | 
     """Return the store that the user names: ``uri``, else ``MLFLOW_TRACKING_URI``, else None.
 
     Args:
-        uri: as the user wrote it; None or empty if not given.
+        uri: address as the user wrote it; None or empty if not given.
         key: the setting or option that ``uri`` comes from, for messages.
         notify: called with a sentence if the environment variable is used.
 
