@@ -60,7 +60,7 @@ def foresee(
         found.append(f"only a TCDM checkout has these tasks, and none was imported here: {names}")
     if approximate:
         names = ", ".join(sorted(approximate))
-        found.append(f"the experts of these tasks are only approximate reconstructions: {names}")
+        found.append(f"the experts of these tasks are reconstructed and only approximate: {names}")
     return found
 
 
