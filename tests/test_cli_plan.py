@@ -213,7 +213,7 @@ def test_a_sweep_says_that_wrists_are_planned_first(library_home: Path) -> None:
         for task in tasks
         for seed in (0, 1)
     ]
-    assert any("2 tasks have a wrist plan" in text for text in foresee(cfgs, open_library()))
+    assert any("2 tasks need a wrist plan" in text for text in foresee(cfgs, open_library()))
     assert not any("wrist" in text for text in foresee([compose([])], open_library()))
 
 

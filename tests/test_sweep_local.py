@@ -94,7 +94,7 @@ def test_a_signal_saves_and_the_same_command_goes_on(folder: Path, number: signa
     ledger = planned(plan(folder, 2, *LONG))
     process = start(folder)
     until(lambda: frames(folder, 0) > 64 and frames(folder, 1) > 64, process)
-    refused = pytest.raises(SweepError, match=f"is run by process {process.pid} already")
+    refused = pytest.raises(SweepError, match=f"is already run by process {process.pid}")
     with refused, held(read_plan(folder)):
         pass
     process.send_signal(number)

@@ -65,8 +65,8 @@ def test_wrong_names(overrides: list[str], message: str) -> None:
     ("text", "message"),
     [
         ("task: [a\n", "not valid YAML"),
-        ("- task\n", "is no sweep file; write lines such as task: tcdm30"),
-        ("", "is no sweep file"),
+        ("- task\n", "is not a sweep file; write lines such as task: tcdm30"),
+        ("", "is not a sweep file"),
         ("algo: {clip: 0.1}\n", "write nested keys in one line"),
     ],
 )

@@ -246,7 +246,7 @@ def test_a_graphics_variable_does_not_stop_python(library_home: Path) -> None:
 
 @pytest.mark.parametrize("overrides", ["seed=1", [None], [3]])
 def test_overrides_that_are_no_list_of_texts(overrides: Any) -> None:
-    with pytest.raises(ConfigError, match="give a list of texts such as 'seed=3'"):
+    with pytest.raises(ConfigError, match="give a list of strings such as 'seed=3'"):
         compose(overrides)
 
 

@@ -1,4 +1,4 @@
-"""From overrides to settings: the one place where they are composed and become an experiment."""
+"""Compose overrides into settings, and settings into a checked experiment."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from pgdm.config.schema import ExperimentCfg
 
 PAPER_FRAMES = 50_000_000
-"""Environment steps behind each value that the paper reports."""
+"""Length of each run in the paper, frames."""
 
 _SEARCH_PATH = "hydra.searchpath="
 _KEY = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*")
@@ -39,14 +39,14 @@ _REFERENCE = re.compile(r"\$\{([\w.\[\]]*\w[\w.\[\]]*)\}")
 
 
 class Composer:
-    """Composes any number of experiments; each file and each combination of options once.
+    """Composes many experiments; reads each file, and composes each choice of options, only once.
 
     Args:
         config_dir: a folder of the user's own settings, searched after pgdm's.
         overrides: as typed; only ``hydra.searchpath`` is read here.
 
     Raises:
-        ConfigError: from here and every method, if a key, an option or a value is wrong.
+        ConfigError: from the constructor and every method, if a key, option or value is wrong.
     """
 
     def __init__(self, config_dir: str | None = None, overrides: Sequence[str] = ()) -> None:
@@ -59,7 +59,7 @@ class Composer:
         own = own_folders(config_dir)
         if any("://" in text.replace("file://", "") for text in search):
             raise ConfigError(f"{search[0]} is refused: only folders are searched, no packages")
-        if search:  # it takes the place of the lasting folder
+        if search:  # it replaces the user's permanent folder
             own = own[:1] if config_dir is not None else []
         with self.explaining(overrides):
             self._loader = Loader(conf_dir(), [folder.absolute() for folder in own], search)
@@ -70,9 +70,9 @@ class Composer:
         """Return the settings with Hydra's own, such as the launcher's, under ``hydra``.
 
         Args:
-            overrides: all of them.
-            multirun: whether values of a sweep are permitted.
-            typed: those among them that the user has typed; None: all.
+            overrides: all overrides.
+            multirun: whether overrides may have several values.
+            typed: the overrides among them that the user has typed; None: all.
         """
         with self.explaining(overrides):
             found = self._loader.whole(overrides, multirun)
@@ -85,7 +85,7 @@ class Composer:
             return self._loader.parse(overrides)
 
     def plain(self, overrides: Sequence[str]) -> dict[str, Any]:
-        """Return an experiment's settings as plain containers, with references filled in.
+        """Return an experiment's settings as plain containers, with references resolved.
 
         They are what Hydra composes, unchecked. The containers may be shared with other results.
         """
@@ -99,16 +99,16 @@ class Composer:
             return _plain(settings)
 
     def check(self, overrides: Sequence[str], settings: Mapping[str, Any]) -> None:
-        """Check composed settings as far as that is possible without the schema, which is slow.
+        """Check composed settings as far as possible without the schema, which is slow to import.
 
         Args:
-            overrides: what they were composed of.
+            overrides: the overrides from which they were composed.
             settings: as returned by ``plain``.
         """
         check_early(dotted(settings), self._divided(overrides)[0].flat)
 
     def _divided(self, overrides: Sequence[str]) -> tuple[_Choice, list[Override]]:
-        """Return the settings that choices of options lead to, and the overrides of keys."""
+        """Return the settings for the options that overrides choose, and the overrides of keys."""
         check_overrides(overrides)
         for text in overrides:
             if text not in self._parsed:
@@ -117,7 +117,7 @@ class Composer:
         parsed = [self._parsed[text] for text in overrides]
         self._loader.check_single([override for override, _ in parsed])
         if any(override.is_hydra_override() for override, _ in parsed):
-            self._loader.whole(overrides, multirun=False)  # refuses wrong ones
+            self._loader.whole(overrides, multirun=False)  # raises if one is wrong
         parsed = [(o, is_choice) for o, is_choice in parsed if not o.is_hydra_override()]
         choices = [override for override, is_choice in parsed if is_choice]
         names = tuple(str(override.input_line) for override in choices)
@@ -127,7 +127,7 @@ class Composer:
 
     @contextmanager
     def explaining(self, overrides: Sequence[str]) -> Iterator[None]:
-        """Turn ``COMPOSITION_ERRORS`` into a ConfigError for the person who typed overrides."""
+        """Turn ``COMPOSITION_ERRORS`` into a ConfigError for the user who typed the overrides."""
         try:
             yield
         except COMPOSITION_ERRORS as error:
@@ -138,7 +138,7 @@ class Composer:
 
 
 class _Choice:
-    """The settings that a combination of options leads to, before keys are changed."""
+    """The settings for a combination of options, before keys are overridden."""
 
     def __init__(self, settings: DictConfig) -> None:
         self.settings = settings
@@ -146,20 +146,20 @@ class _Choice:
         self._plain: dict[str, Any] | None = None
         raw: Any = OmegaConf.to_container(settings, resolve=False)
         self.flat = dotted(raw)
-        """By dotted keys, with references as they are written."""
+        """The settings by dotted key, with references unresolved."""
         for text in _texts(raw):
             self._referred.update(re.findall(r"\w+", " ".join(_REFERENCE.findall(text))))
             if "${" in _REFERENCE.sub("", text):
-                return  # depends on more than these settings
+                return  # OmegaConf must resolve it after keys are overridden
         try:
             self._plain = _plain(settings)
         except OmegaConfBaseException:  # a value is still missing
             return
 
     def changed(self, keys: Sequence[Override]) -> dict[str, Any] | None:
-        """Return the plain settings with keys changed, or None where OmegaConf has to do that.
+        """Return the plain settings with keys overridden, or None if OmegaConf has to do that.
 
-        Here, a key that exists and that nothing refers to gets another number or text.
+        This shortcut only gives a scalar to a key that exists and that no reference mentions.
         """
         if self._plain is None:
             return None
@@ -182,7 +182,7 @@ class _Choice:
 
 
 def _is_simple(override: Override, value: object) -> bool:
-    """Return whether an override changes a key to a number or a text without references."""
+    """Return whether an override changes a key to a scalar without references."""
     if override.type is not OverrideType.CHANGE or override.package is not None:
         return False
     if not _KEY.fullmatch(override.key_or_group):
@@ -214,7 +214,7 @@ def checked(plain: Mapping[str, Any]) -> ExperimentCfg:
     Raises:
         ConfigError: if a key is unknown or missing, or a value is wrong.
     """
-    # The schema loads the simulator and torch: a wrong name is answered before that.
+    # Imported late: the schema loads the simulator and torch, and wrong names are reported before.
     from pgdm.config.identity import default_run_dir
     from pgdm.config.schema import ExperimentCfg, check_device
 
@@ -231,7 +231,7 @@ def checked(plain: Mapping[str, Any]) -> ExperimentCfg:
 
 
 def _budget(total_frames: object) -> str:
-    """Return the true label: a shorter run is not to be compared with the paper's."""
+    """Return the label for ``budget=paper``: ``reduced`` if the run is shorter than the paper's."""
     whole = isinstance(total_frames, int) and total_frames >= PAPER_FRAMES
     return "paper" if whole else "reduced"
 
@@ -250,7 +250,7 @@ def compose(
             one of pgdm's.
     """
     if isinstance(overrides, str) or not all(isinstance(text, str) for text in overrides):
-        raise ConfigError(f"overrides are {overrides!r}; give a list of texts such as 'seed=3'")
+        raise ConfigError(f"overrides are {overrides!r}; give a list of strings such as 'seed=3'")
     folder = None if config_dir is None else str(paths.expanded(config_dir))
     if folder is not None and not Path(folder).is_dir():
         raise ConfigError(f"config_dir '{folder}' is not a folder")
@@ -278,7 +278,7 @@ def _typed(overrides: tuple[str, ...], folder: str | None, stamp: int) -> Experi
 
 
 def _plain_settings(overrides: tuple[str, ...], folder: str | None, stamp: int) -> dict[str, Any]:
-    check_own(folder)  # the sweep files are outside of what the stamp covers
+    check_own(folder)  # not cached, since the stamp does not cover sweep files
     if any(text.startswith(_SEARCH_PATH) for text in overrides):
         return Composer(folder, overrides).plain(overrides)
     return _composer(folder, stamp).plain(overrides)
@@ -290,11 +290,10 @@ def _composer(folder: str | None, _stamp: int) -> Composer:
 
 
 def check_overrides(overrides: Sequence[str]) -> None:
-    """Refuse what Hydra would accept silently, or refuse without naming it.
+    """Refuse overrides that Hydra would silently misread, or refuse without a clear message.
 
     Raises:
-        ConfigError: if an override has no key, gives a group several options, or would make
-            something run.
+        ConfigError: if an override has no key, gives a group several options, or would run code.
     """
     for override in overrides:
         key, _, value = override.partition("=")
@@ -302,7 +301,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
         if not key.strip("+~"):
             raise ConfigError(f"cannot read '{override}'; write key=value, such as seed=3")
         if key == "suite":
-            raise ConfigError(f"a suite is named by its tasks: pgdm-run -m task={value}")
+            raise ConfigError(f"a suite is chosen by the key task: pgdm-run -m task={value}")
         if value.startswith("[") and key in groups():
             # Hydra would merge the options, so that the last one wins.
             raise ConfigError(

@@ -1,4 +1,4 @@
-"""What the files in ``conf/`` document: their keys, values, and the comment on each."""
+"""Read what the files in ``conf/`` document: their keys, values, and the comment on each."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Description:
     title: str
     """The comment at its top."""
     defaults: dict[str, str]
-    """Its defaults list: group to option; the option of a plain file is empty."""
+    """Its defaults list: group to option; an entry that is a file maps to an empty string."""
     keys: list[Key]
     """Its keys, in order."""
 
@@ -45,7 +45,7 @@ def describe(file: Path) -> Description:
         OSError: if it cannot be read.
     """
     text = files.read_text(file)
-    plain = files.parse_yaml(text)  # before the comments are looked for: it sets limits
+    plain = files.parse_yaml(text)  # first, since it enforces limits
     lines = text.splitlines()
     root = yaml.compose(text, Loader=yaml.SafeLoader)
     first = 1 if lines and lines[0].startswith(_PACKAGE_LINE) else 0

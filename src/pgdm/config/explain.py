@@ -1,4 +1,4 @@
-"""What Hydra's and OmegaConf's errors mean for the person who typed the settings."""
+"""Explain Hydra's and OmegaConf's errors to the user who typed the settings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COMPOSITION_ERRORS = (
 """What Hydra and its YAML reader raise for wrong settings."""
 
 Keys = Callable[[Sequence[str]], Sequence[str]]
-"""From overrides to the dotted keys of the settings that they lead to."""
+"""Maps overrides to the dotted keys of the settings composed from them."""
 
 # Groups whose options have different keys.
 _DIFFERING = ("method", "algo")
@@ -33,13 +33,13 @@ _DIFFERING = ("method", "algo")
 def explain(
     error: Exception, overrides: Sequence[str], config_dir: str | None, keys: Keys
 ) -> ConfigError:
-    """Return what an error of ``COMPOSITION_ERRORS`` means, in one line.
+    """Return a ConfigError that explains an error of ``COMPOSITION_ERRORS`` in one line.
 
     Args:
         error: what Hydra, OmegaConf or the YAML reader raised.
-        overrides: what the user gave.
+        overrides: the user's overrides.
         config_dir: the user's own settings folder.
-        keys: lists the valid keys under some overrides, to suggest the nearest.
+        keys: lists the keys that are valid with given overrides, to suggest the nearest.
     """
     text = " ".join(str(error).split())
     if isinstance(error, RecursionError):

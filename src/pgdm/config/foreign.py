@@ -1,4 +1,4 @@
-"""What settings of other people may not do: have Hydra, Python or a shell run something."""
+"""Refuse settings from other people that would make Hydra, Python or a shell run code."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ _REFUSED = {
     "hydra.searchpath": "give the folder with --config-dir",
     "sweep.most_jobs": "type it after pgdm-run",
 }
-"""Keys that would be obeyed, and what to say about each."""
+"""Keys that Hydra or pgdm would obey but that are refused, and the reason given to the user."""
 _TYPED = ("hydra.searchpath", "sweep.most_jobs")
-"""Those that a user may type."""
+"""Those of them that a user may type on the command line."""
 _HANDLING = {"handlers", "formatters", "filters", "loggers"}
 _SHELL = ("setup", "additional_parameters")
-"""Keys of a launcher that end in a shell or a command line."""
+"""Keys of a launcher whose values are passed to a shell or a command line."""
 
 
 def check_settings(settings: object, where: str, typed: bool = False) -> None:
-    """Refuse settings that would make something run.
+    """Refuse settings that would run code, and those that only the command line may set.
 
     Args:
-        settings: plain containers; their keys may be dotted, as overrides are.
-        where: the file, or the command line.
+        settings: plain containers; their keys may be dotted, as in overrides.
+        where: the file or command line that they come from, for the message.
         typed: whether the user has typed them.
 
     Raises:
-        ConfigError: names place and key.
+        ConfigError: if a key is refused; the message names ``where`` and the key.
     """
     for key in _keys(settings, ""):
         for refused, reason in _REFUSED.items():
@@ -47,12 +47,12 @@ def check_settings(settings: object, where: str, typed: bool = False) -> None:
                 raise ConfigError(f"{where}: {key} is refused ({reason}); leave it out")
         if key.endswith("_target_"):
             raise ConfigError(
-                f"{where}: {key} is refused (settings name no code to run); leave it out"
+                f"{where}: {key} is refused (settings may not name code to run); leave it out"
             )
 
 
 def _keys(value: object, path: str) -> Iterator[str]:
-    """Yield the dotted key of every value; an override's group and package count as keys."""
+    """Yield the dotted key of every value; of an override ``group@package``, the package."""
     yield path
     if isinstance(value, Mapping):
         for name, inner in value.items():
@@ -61,7 +61,7 @@ def _keys(value: object, path: str) -> Iterator[str]:
     elif isinstance(value, list):
         for inner in value:
             yield from _keys(inner, path)
-    elif isinstance(value, str) and "_target_" in value:  # a mapping, written as one text
+    elif isinstance(value, str) and "_target_" in value:  # a mapping written as a string
         yield f"{path}._target_"
 
 
@@ -69,7 +69,7 @@ def check_file(file: Path) -> None:
     """Check a file of settings that does not come with pgdm, before Hydra reads it.
 
     Raises:
-        ConfigError: if it cannot be read, or would make something run; names file and key.
+        ConfigError: if it cannot be read, or has a key that is refused; names file and key.
     """
     try:
         settings = files.read_yaml(file)
@@ -79,14 +79,14 @@ def check_file(file: Path) -> None:
 
 
 def check_composed(hydra: Mapping[str, Any], typed: Sequence[str]) -> None:
-    """Check Hydra's own settings once composed: files may put their keys anywhere.
+    """Check Hydra's own settings after composition, since any file can set any of their keys.
 
     Args:
         hydra: the settings under ``hydra``.
         typed: overrides that the user has typed.
 
     Raises:
-        ConfigError: if callbacks, handlers of logs or shell commands that nobody typed are there.
+        ConfigError: if they have callbacks, log handlers, or shell commands that nobody typed.
     """
     if hydra.get("callbacks"):
         raise ConfigError("hydra.callbacks is refused (it names code to run); leave it out")
@@ -105,14 +105,14 @@ def check_composed(hydra: Mapping[str, Any], typed: Sequence[str]) -> None:
 
 
 def check_method(settings: Mapping[str, Any], where: str) -> None:
-    """Refuse to import the module of a method that the user has neither run nor named.
+    """Refuse settings whose method is in a module that the user has neither imported nor trusted.
 
     Args:
         settings: of a run; only a ``method.name`` of the form ``module:attribute`` is imported.
-        where: what they are from.
+        where: where they come from, for the message.
 
     Raises:
-        ConfigError: says how to permit it.
+        ConfigError: if the module is not trusted; the message says how to trust it.
     """
     module = _module(settings)
     if module is not None and module not in sys.modules and module not in _trusted():
@@ -123,7 +123,7 @@ def check_method(settings: Mapping[str, Any], where: str) -> None:
 
 
 def trust_method(settings: Mapping[str, Any]) -> None:
-    """Remember that the user has named a method, here and in processes started from here."""
+    """Trust the module of a method: in this process, in those it starts and in later commands."""
     if (module := _module(settings)) is None or module in _trusted():
         return
     os.environ[TRUSTED] = ",".join(sorted(_trusted() | {module}))
@@ -134,11 +134,11 @@ def trust_method(settings: Mapping[str, Any]) -> None:
 
 
 def named_methods(typed: Sequence[str], folders: Sequence[Path]) -> set[str]:
-    """Return the ``method.name`` that each of a user's words stands for.
+    """Return each ``method.name`` that the user's overrides choose.
 
     Args:
         typed: overrides that the user has typed; several values are separated by commas.
-        folders: of the user's own settings, which may hold the file of a method.
+        folders: the user's settings folders, which may hold a method's file.
     """
     words: dict[str, set[str]] = {"method": set(), "method.name": set()}
     for key, _, values in (text.lstrip("+").partition("=") for text in typed):

@@ -20,9 +20,9 @@ GROUPS = {
     "reference": "reference.frame",
     "hand": "hand.name",
 }
-"""Config group to the key of a configuration that holds the name of the chosen option."""
+"""Config group to the key that holds the name of the chosen option."""
 
-# Folders of conf/ that are not settings of a run.
+# Folders in conf/ that are not config groups of a run.
 _NO_GROUPS = ("hydra", "suite", "sweeps")
 
 
@@ -48,19 +48,19 @@ def folders(config_dir: str | Path | None) -> list[Path]:
 def own_folders(config_dir: str | Path | None) -> list[Path]:
     """Return the user's folders of settings in Hydra's order of search.
 
-    First the one named in this command, then the permanent one.
+    First ``config_dir``, then the permanent one, ``paths.user_conf()``.
     """
     lasting = [paths.user_conf()] if paths.user_conf().is_dir() else []
     return lasting if config_dir is None else [Path(config_dir), *lasting]
 
 
 def check_own(config_dir: str | Path | None) -> None:
-    """Refuse the user's files that have the group and name of one of pgdm's.
+    """Refuse a file of the user's that has the group and name of one of pgdm's.
 
-    Hydra finds pgdm's first, and would use it silently.
+    Hydra finds pgdm's file first, and would silently use it instead.
 
     Raises:
-        ConfigError: at the first one; names both files.
+        ConfigError: at the first such file; the message names both files.
     """
     ours = conf_dir()
     # The sweep files are in a folder next to conf/.
@@ -106,7 +106,7 @@ def available(group: str, config_dir: str | Path | None = None) -> list[str]:
 
 
 def unreadable(group: str, config_dir: str | Path | None = None) -> dict[Path, str]:
-    """Return the files of a config group that are no options, each with the reason."""
+    """Return the files of a config group that cannot be options, each with the reason."""
     reasons = {path: unusable(path) for path in _files(group, config_dir)}
     return {path: reason for path, reason in reasons.items() if reason is not None}
 

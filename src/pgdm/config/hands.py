@@ -12,7 +12,7 @@ def own_hand(cfg: ExperimentCfg, library: Library) -> HandCfg:
     """Return the hand of the motion's stored start states, whichever hand the experiment uses.
 
     Raises:
-        UnknownNameError: the library lacks the motion, or there are no settings of the hand.
+        UnknownNameError: if the library lacks the motion, or there are no settings for its hand.
     """
     name = library.entry(cfg.task.motion).hand
     return cfg.hand if cfg.hand.name == name else compose([f"hand={name}"]).hand

@@ -1,7 +1,7 @@
-"""All that pgdm uses of Hydra's private interfaces; no other module imports ``hydra._internal``.
+"""Everything pgdm uses of Hydra's private interfaces; only this module imports ``hydra._internal``.
 
-Hydra's public functions compose one set of overrides and read every file anew. A sweep of thousands
-of runs needs the steps in between.
+Hydra's public functions compose one set of overrides at a time and reread every file, which is too
+slow for a sweep of thousands of runs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pgdm.config.foreign import check_file
 from pgdm.errors import PgdmError
 
 CHECKED_WITH = "1.3.8"
-"""Version of hydra-core whose private interfaces this module was compared with."""
+"""Version of hydra-core for whose private interfaces this module was written."""
 
 
 def _changed(what: str) -> PgdmError:
@@ -59,7 +59,7 @@ _USED = {
 
 _CONFIG, _VERSION_BASE = "config", "1.3"
 
-_LOCK = threading.RLock()  # Hydra's version base is state of the whole process
+_LOCK = threading.RLock()  # Hydra's version base is global to the process
 
 
 def check_interfaces() -> None:
@@ -75,7 +75,7 @@ def check_interfaces() -> None:
 
 
 class _ReadOnce(ConfigLoaderImpl):
-    """Hydra's loader with the files read so far kept for all compositions."""
+    """Hydra's loader, which here keeps files once read for all later compositions."""
 
     _files: Any = None
 
@@ -92,14 +92,14 @@ class _ReadOnce(ConfigLoaderImpl):
         return OverridesParser.create().parse_overrides(overrides), self._files
 
     def _load_single_config(self, default: Any, repo: Any) -> ConfigResult:
-        # A copy: Hydra merges the files' own nodes, and later files and overrides would change
-        # them for all compositions that follow.
+        # A copy, since Hydra merges later files and overrides into these nodes in place, which
+        # would change all later compositions.
         found = super()._load_single_config(default, repo)
         return replace(found, config=copy.deepcopy(found.config))
 
 
 def _check_before_reading(source: ConfigSource) -> None:
-    """Have a folder's files checked before Hydra reads them."""
+    """Make a source of settings check each of its files before Hydra reads it."""
     read = source.load_config
 
     def load_config(config_path: str) -> ConfigResult:
@@ -139,7 +139,7 @@ class Loader:
 
         Args:
             overrides: as typed.
-            multirun: leave out those with several values instead of refusing them.
+            multirun: leave out overrides with several values instead of refusing them.
         """
         mode = RunMode.MULTIRUN if multirun else RunMode.RUN
         with _composing():
@@ -155,7 +155,7 @@ class Loader:
         return known and not isinstance(override.value(), dict)
 
     def chosen(self, choices: Sequence[Override]) -> DictConfig:
-        """Compose the settings, without Hydra's own, that choices of options lead to."""
+        """Compose the settings for chosen options, without Hydra's own."""
         with _composing():
             found = _defaults.create_defaults_list(
                 repo=self._files,
@@ -181,7 +181,7 @@ class Loader:
 
 @contextmanager
 def _composing() -> Iterator[None]:
-    """Have Hydra skip the larger part of its work on defaults lists, which has no result here."""
+    """Lock Hydra's global state, and skip the largest part of its work, not needed here."""
     with _LOCK:
         version.setbase(_VERSION_BASE)
         before = _defaults._create_interpolation_map
@@ -193,7 +193,7 @@ def _composing() -> Iterator[None]:
 
 
 def _only_if_read(build: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a builder of the map that resolves references between entries of a defaults list."""
+    """Wrap the builder of Hydra's map of references in a defaults list to skip unused maps."""
 
     def build_if_read(overrides: Any, defaults_list: list[Any], self_added: bool) -> Any:
         read = any(not entry.is_self() and entry.is_interpolation() for entry in defaults_list)

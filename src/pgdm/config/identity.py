@@ -13,7 +13,7 @@ from pgdm.errors import RunError
 from pgdm.paths import inside
 from pgdm.runs.config_file import dotted
 
-if TYPE_CHECKING:  # it loads the simulator and torch
+if TYPE_CHECKING:  # the schema loads the simulator and torch
     from pgdm.config.schema import ExperimentCfg
 
 # Keys that change where, when and how a run is done or displayed, but not what it computes.
@@ -26,7 +26,7 @@ _BESIDE = (
     "num_threads",  # simulations do not depend on it
     "device",  # a run may move between machines
     "time_limit_min",
-    "total_frames",  # a longer run begins with the shorter one
+    "total_frames",  # a longer run can resume a shorter one
     "tracking",
     "checkpoint",
     "eval.interval_frames",
@@ -56,12 +56,12 @@ ADDED_LATER: dict[str, Any] = {
     "time_limit_min": None,
 }
 
-# They have an effect only if the wrist is planned.
+# Keys that have an effect only if the wrist is planned.
 _ONLY_PLANNED = ("action.hold_steps", "action.carry_load")
 
 
 def with_added_keys(plain: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a stored configuration, completed with keys that were added since."""
+    """Return a stored configuration, completed with the keys that were added since."""
     result = dict(plain)
     for key, value in ADDED_LATER.items():
         group, _, name = key.rpartition(".")
@@ -75,8 +75,8 @@ def with_added_keys(plain: Mapping[str, Any]) -> dict[str, Any]:
 def identity(cfg: ExperimentCfg) -> dict[str, Any]:
     """Return the keys (dotted) and values that change the result of an experiment.
 
-    A key of ``ADDED_LATER`` is left out if it has the value there, so that an experiment keeps the
-    hash, folder and sweep job that it had before the key existed.
+    A key of ``ADDED_LATER`` is left out if it has the value listed there, so that an experiment
+    keeps the hash, folder and sweep job that it had before the key existed.
     """
     idle = () if cfg.action.plans_wrist else _ONLY_PLANNED
     return {
@@ -102,9 +102,8 @@ def default_run_dir(cfg: ExperimentCfg) -> str:
     """Return the default run folder of an experiment, relative to the working directory."""
     start = f"{cfg.pregrasp.source}-{cfg.action.kind}-{cfg.algo.name}"
     name = f"{start}-s{cfg.seed}-{identity_hash(cfg)}"
-    method = cfg.method.name.replace(
-        ":", "."
-    )  # of a user's own method; every system allows the dot
+    # A user's method is named module:attribute; not every file system allows the colon.
+    method = cfg.method.name.replace(":", ".")
     return str(inside(Path("runs"), cfg.task.id, method, name))
 
 
@@ -122,7 +121,7 @@ def check_continues(old: ExperimentCfg, new: ExperimentCfg) -> None:
     """Check that ``new`` may resume in the run folder that ``old`` was saved in.
 
     Raises:
-        RunError: if it is another experiment, or a shorter one; the message is the difference.
+        RunError: if ``new`` is another or a shorter experiment; the message lists the differences.
     """
     changes = difference(old, new)
     if new.total_frames < old.total_frames:

@@ -1,4 +1,4 @@
-"""What can be checked of composed settings before torch and the simulator load."""
+"""Checks of composed settings that need neither torch nor the simulator."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def check_ranges(flat: Mapping[str, object]) -> None:
     """Check the range of each number.
 
     Args:
-        flat: settings by their dotted keys; each learner has other keys.
+        flat: settings by their dotted keys; keys that the learner does not have are skipped.
 
     Raises:
         ConfigError: at the first number out of its range.
@@ -89,11 +89,11 @@ def check_ranges(flat: Mapping[str, object]) -> None:
 
 
 def check_early(flat: Mapping[str, object], before: Mapping[str, object]) -> None:
-    """Check what a schema would refuse, as far as it can be seen without one.
+    """Check types and ranges as far as possible without importing the schema.
 
     Args:
         flat: settings by their dotted keys.
-        before: the same before keys were changed.
+        before: the same settings before keys were overridden.
 
     Raises:
         ConfigError: if a number or truth value was replaced by something else, or a number is out
@@ -103,7 +103,7 @@ def check_early(flat: Mapping[str, object], before: Mapping[str, object]) -> Non
     for key, value in flat.items():
         kind = type(before.get(key))
         if kind is int and isinstance(value, float):
-            continue  # of a key for floats whose value was a whole number, or 1e6 for 1000000
+            continue  # a float key whose default is a whole number, or 1e6 for an int key
         if kind in (bool, int, float) and isinstance(value, str | int | float):
             checked[key] = scalar(kind, value, key)
     check_ranges(checked)

@@ -30,8 +30,8 @@ def save_config(cfg: ExperimentCfg, run_dir: str | os.PathLike[str]) -> Path:
 def load_config(run_dir: str | os.PathLike[str]) -> ExperimentCfg:
     """Read the configuration of a run folder.
 
-    Its ``run_dir`` is the folder it was read from, wherever the run has been moved to. Keys that
-    are newer than the run get the values that the run amounts to.
+    Its ``run_dir`` is the folder it was read from, even if the run has been moved. Keys that are
+    newer than the run get the values that correspond to what the run did.
 
     Raises:
         RunError: if the folder holds no run.
@@ -56,7 +56,7 @@ def typed(plain: Mapping[str, Any], where: str, run_dir: str) -> ExperimentCfg:
 
     Args:
         plain: plain containers, as `write_config` stores them.
-        where: what they are from.
+        where: where they come from, for the messages.
         run_dir: folder of the run.
 
     Raises:
@@ -83,7 +83,7 @@ def check_run_dir(cfg: ExperimentCfg) -> None:
     """Check that a run may use its folder: it is new, or holds the same experiment.
 
     Raises:
-        RunError: if it holds something else, or ``resume`` forbids it.
+        RunError: if the folder holds something else, or ``resume`` forbids using it.
     """
     if holds_run(Path(cfg.run_dir), cfg.resume):
         old = load_config(cfg.run_dir)

@@ -29,7 +29,7 @@ from pgdm.tracking import TRACKERS, TrackingCfg
 
 @dataclass(frozen=True)
 class ExperimentCfg:
-    """All settings of one run; created only by ``pgdm.config.compose``."""
+    """All settings of one run, composed by ``pgdm.config.compose`` or read from a file."""
 
     task: TaskCfg
     """The object and the motion it follows."""
@@ -44,7 +44,7 @@ class ExperimentCfg:
     obs: ObsCfg
     """What the policy sees."""
     action: ActionCfg
-    """What an action means."""
+    """How actions become actuator targets."""
     shaping: ShapingCfg
     """What is added to reward and terminations in training, never in evaluation."""
     reference: ReferenceCfg
@@ -52,19 +52,19 @@ class ExperimentCfg:
     algo: Annotated[AlgoCfg, ChosenBy("learner", algo_class, tuple(ALGOS))]
     """The learner and its settings."""
     sim: SimCfg
-    """Solver settings."""
+    """Physics engine, solver and object masses."""
     eval: EvalCfg
     """How and how often the policy is evaluated."""
     checkpoint: CheckpointCfg
-    """How often the run is saved."""
+    """How often the run is saved, and how many checkpoints are kept."""
     tracking: TrackingCfg
     """Where the run is mirrored."""
     seed: int
     """The one integer from which all random streams are derived, 0 or more."""
     total_frames: int
-    """Length of the training, environment steps over all simulations."""
+    """Length of the training, frames: control steps summed over all simulations."""
     time_limit_min: float | None
-    """Time after which training ends early, over all attempts; None: never [min]."""
+    """Wall time, summed over all attempts, after which training ends early; None: never [min]."""
     num_envs: int
     """Parallel simulations."""
     num_threads: int
@@ -74,7 +74,8 @@ class ExperimentCfg:
     run_dir: str
     """Folder of the run."""
     resume: str
-    """An existing run: ``auto`` resumes it, ``must`` demands one, ``never`` refuses."""
+    """Whether an existing run is resumed: ``auto`` if there is one; ``must`` fails without one,
+    ``never`` fails with one."""
     budget: str
     """Label for reports, such as smoke, reduced or paper."""
     keep_replay: bool
@@ -192,13 +193,13 @@ def _check_choices(flat: dict[str, object]) -> None:
 
 
 def check_device(device: str) -> None:
-    """Check that this machine has the device; reading a stored run does not need it.
+    """Check that this machine has the device, which reading a stored run does not require.
 
     Raises:
-        ConfigError: if it has not.
+        ConfigError: if the machine lacks it.
     """
     if device.startswith("cuda"):
-        # Only here: looking for a GPU takes time, and most runs use none.
+        # Imported only here: looking for a GPU takes time, and most runs use none.
         import torch
 
         if not torch.cuda.is_available():

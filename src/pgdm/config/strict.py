@@ -1,4 +1,4 @@
-"""From plain data to frozen dataclasses; names and types must match exactly."""
+"""Build frozen dataclasses from plain data, whose names and types must match exactly."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ T = TypeVar("T")
 _KIND = {int: "an integer", float: "a number", bool: "true or false", str: "text"}
 
 _LARGEST = {int: 2**63 - 1, float: 1e15}
-"""Of absolute values: 64 bits, and what has a finite square in 32 bits."""
+"""Largest absolute values: an int fits 64 bits, and the square of a float is finite in float32."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class ChosenBy:
     key: str
     """The key, whose value is text."""
     find: Callable[[str], type]
-    """From its value to the class, a subclass of the one written down; raises ConfigError."""
+    """Maps its value to the class, a subclass of ``Base``; raises ConfigError."""
     names: tuple[str, ...]
     """Known values, for the messages; ``find`` may accept others too."""
 
@@ -63,11 +63,11 @@ def build(cls: type[T], data: object, path: str = "") -> T:
     """Build a dataclass, and the dataclasses inside it, from plain data.
 
     Args:
-        cls: the dataclass; its fields may be bool, int, float, str, lists, dataclasses or one of
-            these or None.
+        cls: the dataclass; its fields may be bool, int, float, str, lists or dataclasses, or a
+            union of one of these and None.
         data: a mapping with exactly its fields. A whole number is a valid float, and a float
             without a fraction (1e6) a valid int; nothing else is converted.
-        path: dotted key of the data in the whole, for the messages.
+        path: dotted key of the data within all settings, for the messages.
 
     Raises:
         ConfigError: if a key is missing or unknown, or a value has the wrong type.
@@ -78,7 +78,7 @@ def build(cls: type[T], data: object, path: str = "") -> T:
     names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
     for key in data:
         if key not in names:
-            # Only the last part differs, so that the nearest names are compared without the rest.
+            # Names are compared without the path, which is the same for all of them.
             where = f"key of '{path}'" if path else "key"
             raise UnknownNameError(where, str(key), names, meant=meant(str(key), names))
     missing = [_join(path, name) for name in names if name not in data]
@@ -108,10 +108,10 @@ def _value(hint: Any, value: object, path: str) -> Any:
 
 
 def scalar(kind: type, value: object, path: str) -> bool | int | float | str:
-    """Return a bool, int, float or str as the kind that a key has.
+    """Return a bool, int, float or str as the type that a key has.
 
     Raises:
-        ConfigError: if it is of another kind.
+        ConfigError: if it is of another type, too large or not finite.
     """
     if kind in (int, float) and isinstance(value, int | float) and not isinstance(value, bool):
         if math.isfinite(value) and abs(value) > _LARGEST[kind]:

@@ -18,7 +18,7 @@ _WILD = "*?["
 
 
 def suites(config_dir: str | Path | None = None) -> dict[str, Path]:
-    """Return the suites' files by name; for a name that pgdm and the user have, pgdm's file."""
+    """Return the suites' files by name; pgdm's file comes before a user's of the same name."""
     own_last = [f for folder in folders(config_dir) for f in (folder / "suite").glob("*.yaml")]
     found = {file.stem: file for file in reversed(own_last)}
     return dict(sorted(found.items()))
@@ -37,7 +37,7 @@ def suite(name: str, config_dir: str | Path | None = None) -> tuple[str, ...]:
 
 
 def expand_tasks(words: Iterable[str], config_dir: str | Path | None = None) -> tuple[str, ...]:
-    """Return the tasks that words name, each once, in the order of their first mention.
+    """Return the tasks that ``words`` name, each once, in the order of their first mention.
 
     Args:
         words: each a task, a suite, a pattern such as ``dhand-*``, or one of these after a minus,
@@ -62,7 +62,7 @@ def check_task(name: str) -> None:
 
 
 def unknown_task(name: str, config_dir: str | Path | None) -> ConfigError:
-    """Return the error of a name that should be one task and is none."""
+    """Return the error for a name that should be a single task but is not."""
     if name in suites(config_dir):
         size = len(suite(name, config_dir))
         return ConfigError(
@@ -119,7 +119,7 @@ class _Expansion:
         places = [folder / "task" / f"{task}.yaml" for folder in self.folders]
         try:
             facts = task_facts(next(file for file in places if file.is_file()))
-        except ConfigError as error:  # one file of the user's does not block the others
+        except ConfigError as error:  # a user's wrong file must not block the other tasks
             _log.warning("task '%s' is left out of suites: %s", task, error)
             return False
         return all(
@@ -129,7 +129,7 @@ class _Expansion:
 
 
 def task_facts(file: Path) -> dict[str, Any]:
-    """Return the keys in the file of a task itself, with its own hand as ``hand``."""
+    """Return the keys in a task's file; ``hand`` is the hand in its defaults list."""
     content = _read(file)
     for entry in content.pop("defaults", None) or []:
         for key, option in entry.items() if isinstance(entry, dict) else ():

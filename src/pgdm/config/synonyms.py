@@ -1,10 +1,10 @@
-"""What people type who know the settings of other libraries."""
+"""Names that other libraries use for pgdm's settings."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-# Name elsewhere -> keys and groups here: as in Stable-Baselines3, rsl_rl, CleanRL, TorchRL.
+# Names in Stable-Baselines3, rsl_rl, CleanRL and TorchRL -> keys and groups of pgdm.
 _MEANT = {
     ("lr", "alpha_lr", "step_size"): ("learning_rate",),
     ("bs", "batch", "minibatch", "mini_batch_size"): ("minibatch_size", "batch_size"),
@@ -44,7 +44,7 @@ _KEYS = {other: ours for others, ours in _MEANT.items() for other in others}
 
 
 def meant(key: str, names: Iterable[str]) -> list[str]:
-    """Return the names that someone means by a key of another library, or by a part of a name.
+    """Return the names probably meant by a key of another library, or by the last part of a name.
 
     Args:
         key: an unknown key, dotted or not.

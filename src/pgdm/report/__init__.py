@@ -1,1 +1,1 @@
-"""Results as a page, tables and figures, compared with the paper and with doing nothing."""
+"""Results as a page, tables and figures, next to the paper and to a policy that does nothing."""

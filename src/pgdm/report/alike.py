@@ -1,4 +1,4 @@
-"""Runs that have one setting but differ in start, assets or scene."""
+"""Find runs of one setting that differ in start state, assets or scene."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Mixed(NamedTuple):
 
 
 class Double(NamedTuple):
-    """A run that is left out because another one counts."""
+    """A run that is left out because another with equal setting, task and seed counts."""
 
     run: Run
     differences: list[str]
@@ -60,7 +60,8 @@ def left_out(results: Results) -> list[Double]:
 def _facts(run: Run) -> dict[str, str]:
     """Return the facts that a run recorded.
 
-    A scene is a fact of its task and asset source, since only scenes of the same two compare.
+    The fact of a scene is named after asset source and task: only scenes of the same asset source
+    and task are comparable.
     """
     found = {fact: run.result.get(key) for fact, key in _FACTS.items()}
     if (scene := run.result.get("scene_sha256")) is not None:

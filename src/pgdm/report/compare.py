@@ -13,7 +13,7 @@ from pgdm.runs.config_file import dotted
 from pgdm.runs.folder import RunFolder
 
 ALSO = ("total_frames", "num_threads", "device")
-"""Settings that are compared though they do not change what a run computes."""
+"""Settings that are compared even though they do not change what a run computes."""
 RESULTS = {
     "success, sampled": SUCCESS,
     "success, mean action": SUCCESS_MEAN,
@@ -27,21 +27,21 @@ class Comparison:
     """Two or more runs.
 
     Args:
-        folders: of the runs.
+        folders: folders of the runs.
 
     Raises:
-        RunError: if one cannot be read.
+        RunError: if a run cannot be read.
     """
 
     def __init__(self, folders: Sequence[RunFolder]) -> None:
         self.runs: list[Run] = [read_run(folder) for folder in folders]
         shared = os.path.commonpath([run.path.parent for run in self.runs])
         self.names = [os.path.relpath(run.path, shared) for run in self.runs]
-        """Of the runs, below the folder that all are in."""
+        """Paths of the run folders, relative to the folder that contains all of them."""
         self._settings = [dotted(folder.config) for folder in folders]
 
     def differences(self) -> dict[str, list[Any]]:
-        """Return the settings that differ: key to the value in each run, None where it has none."""
+        """Return the settings that differ: key to the value in each run, None if it is missing."""
         keys = sorted({key for settings in self._settings for key in settings})
         rows = {key: [settings.get(key) for settings in self._settings] for key in keys}
         return {
@@ -62,10 +62,10 @@ class Comparison:
         return found
 
     def draw(self, file: Path) -> None:
-        """Draw success and return over frames into a PNG, all runs on the same axes."""
+        """Plot success and training return over frames into a PNG, all runs on the same axes."""
         from pgdm.report.figures import COLOURS, DPI, line_axes
 
-        figure, panels = line_axes({"success, sampled": (0, 1), "return of the training": None})
+        figure, panels = line_axes({"success, sampled": (0, 1), "training return": None})
         for number, (name, run) in enumerate(zip(self.names, self.runs, strict=True)):
             style = {"color": COLOURS[number % len(COLOURS)], "lw": 1.6}
             panels[0].plot(run.evaluations["frames"], run.evaluations[SUCCESS], label=name, **style)

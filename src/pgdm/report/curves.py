@@ -24,9 +24,9 @@ from pgdm.report.runs import ERROR, SUCCESS, Run
 # Inches: a panel, and the axes in it (left, bottom, width, height).
 _PANEL = (2.9, 2.2)
 _INNER = (0.5, 0.35, 2.25, 1.5)
-_LEGEND = 0.2  # height of a line
+_LEGEND = 0.2  # height of a line of the legend
 _COLUMNS = 5
-_POINTS = 200  # of a mean curve, at most
+_POINTS = 200  # maximum number of points of a mean curve
 _NAMES = {SUCCESS: "success", ERROR: "COM error, released form [m]"}
 _PAPER = {SUCCESS: "paper_success", ERROR: "paper_com_error"}
 _GREY = "#888888"
@@ -38,7 +38,7 @@ class _Scale:
 
     logarithmic: bool
     furthest: float  # frames
-    low: float
+    low: float  # of the values; of their log10 if logarithmic
     high: float
 
     def __call__(self, frames: Array, values: Array) -> Array:
@@ -184,7 +184,7 @@ def mean_curve(runs: Sequence[Run], metric: str) -> tuple[Array, Array, Array]:
 
 
 def mean_line(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
-    """Return the same over pairs of frames and values, interpolated linearly."""
+    """Return the same for curves, each a pair of frames and values to interpolate linearly."""
     last = min(frames[-1] for frames, _ in lines)
     every = np.unique(np.concatenate([frames for frames, _ in lines]))
     every = every[every <= last]

@@ -1,4 +1,4 @@
-"""All numbers of the page as CSV, and the data they were computed from."""
+"""All numbers of the page as CSV files, and the data from which they were computed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FACTS = (
     "ablation_finger_error_rad",
     "ablation_depth_mm",
 )
-"""Keys of ``result.json`` in ``runs.csv``; those of an ablated start need an ablation."""
+"""Keys of ``result.json`` in ``runs.csv``; only runs with an ablation have ``ablation_...``."""
 
 Aggregates = dict[Setting, tuple[Estimate, list[Estimate], int, int]]
 Improvements = dict[tuple[Setting, Setting], Improvement]

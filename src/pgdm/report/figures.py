@@ -1,4 +1,4 @@
-"""The figures of the report, except learning curves; thumbnails of its videos."""
+"""The figures of the report except learning curves, and the thumbnails of its videos."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
 from pgdm.report.tables import THRESHOLDS, Average, by_group
 
-# Okabe and Ito's colours, which colour-blind people can distinguish, then darker ones.
+# Okabe and Ito's colours, which colour-blind people can distinguish, then darker colours.
 COLOURS = (
     *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F", "#000000"),
     *("#332288", "#882255", "#999933", "#44AA99", "#117733", "#AA4499", "#661100", "#6699CC"),
@@ -37,7 +37,7 @@ _WIDTH_IN = 5.2
 _PALE = 0.45  # opacity without pre-grasps
 _CEILINGS = (0.1, 0.2, 0.5, 1.0)  # upper limits of success axes
 _THUMB = (240, 180)  # pixels
-_SHADES = 12  # of each colour, for antialiased lines
+_SHADES = 12  # number of shades of each colour, for antialiased lines
 
 
 def colour(results: Results, setting: Setting) -> str:
@@ -98,9 +98,9 @@ def bars(rows: Sequence[Average]) -> Figure:
 
 
 def shades(rows: Sequence[Average]) -> dict[Setting, RGBA]:
-    """Return the rows' colours: the hue by name, pale without pre-grasps.
+    """Return the rows' colours: a hue for each name, pale without pre-grasps.
 
-    All groups share one legend, so a name has the same hue in each of them.
+    All groups share one legend, so a name has the same hue in every group.
     """
     hues = list(dict.fromkeys(row.hue for row in rows))
     return {
@@ -113,7 +113,7 @@ def shades(rows: Sequence[Average]) -> dict[Setting, RGBA]:
 
 
 def axis_end(metric: str, most: float) -> float:
-    """Return the upper limit of an axis of success or error for a largest value."""
+    """Return the upper limit of an axis of success or error for values up to ``most``."""
     if metric == SUCCESS:
         return next((high for high in _CEILINGS if high >= most), most)
     return 1.1 * most or 1.0
@@ -123,8 +123,8 @@ def pairs(heights_in: Sequence[float], more_in: float, **shared: Any) -> Pairs:
     """Return axes for success and error side by side, a pair for each height.
 
     Args:
-        heights_in: heights of the axes.
-        more_in: height of everything around them.
+        heights_in: heights of the axes, inches.
+        more_in: total height of everything around them, inches.
         shared: ``sharex`` and ``sharey`` of Matplotlib's ``subplots``.
     """
     figure = _figure(sum(heights_in) + more_in)
@@ -136,13 +136,13 @@ def pairs(heights_in: Sequence[float], more_in: float, **shared: Any) -> Pairs:
 
 
 def few_ticks(axis: Axis, most: int) -> None:
-    """Put ticks at round values, with short labels and a number of steps at most."""
+    """Put ticks at round values, with short labels and at most ``most`` intervals."""
     axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10]))
     axis.set_major_formatter("{x:g}")
 
 
 def wrapped(name: str, width: int = 26) -> str:
-    """Return a name broken at its commas into lines of about a width."""
+    """Return a name broken at its commas into lines of up to ``width`` characters if possible."""
     lines = [""]
     for part in name.split(", "):
         glued = f"{lines[-1]}, {part}" if lines[-1] else part
@@ -155,7 +155,7 @@ def _most(estimates: Iterable[Estimate]) -> float:
 
 
 def _extent(rows: Sequence[Average]) -> str:
-    """Return the tasks and frames behind a group's bars; all its runs have equal length."""
+    """Return a text on tasks and frames behind a group's bars; all its runs are equally long."""
     counts = [len(row.tasks) for row in rows]
     least, most = min(counts), max(counts)
     number = f"{least}" if least == most else f"{least} to {most}"
@@ -203,7 +203,7 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
 
 
 def line_axes(panels: dict[str, tuple[float, float] | None]) -> tuple[Figure, list[Axes]]:
-    """Return a figure with panels below each other: label of the values to their range, if set."""
+    """Return a figure with a panel below another for each label; its y-range may be given."""
     figure = _figure(2.2 * len(panels) + 0.6)
     drawn = list(figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0])
     for axes, (label, extent) in zip(drawn, panels.items(), strict=True):
@@ -236,7 +236,7 @@ def thumbnail(poster: Path) -> bytes | None:
 
 
 def png(picture: Image.Image) -> bytes:
-    """Return a figure as PNG with a small palette, a quarter of the size."""
+    """Return a figure as PNG with a small palette, which makes it a quarter of the size."""
     stream = io.BytesIO()
     picture.quantize(palette=_palette(), dither=Image.Dither.NONE).save(stream, "PNG")
     return stream.getvalue()

@@ -24,7 +24,7 @@ Tasks = Sequence[Sequence[Run]]
 
 @dataclass(frozen=True)
 class Line:
-    """A mean over tasks."""
+    """A curve: the mean over tasks."""
 
     name: str
     """Name in the legend; empty for none."""
@@ -40,7 +40,7 @@ Panels = dict[str, list[Line]]
 def over_tasks(tasks: Tasks, metric: str) -> tuple[Array, Array]:
     """Return frames, and the mean over tasks of each task's mean over its runs.
 
-    It ends where the shortest run does.
+    The curve ends where the shortest run does.
     """
     frames, mean, _ = mean_line([mean_curve(runs, metric)[:2] for runs in tasks])
     return frames, mean
@@ -49,7 +49,7 @@ def over_tasks(tasks: Tasks, metric: str) -> tuple[Array, Array]:
 def compared(results: Results, rows: Sequence[Average]) -> Figure | None:
     """Draw a line for each row, a panel for each group; None if no group has a shared task.
 
-    Only tasks that all rows of a group have count; otherwise the lines would compare tasks.
+    Only tasks that all rows of a group share count; otherwise the lines would differ by task.
     """
     shade, panels = shades(rows), {}
     for group, own in by_group(rows).items():
@@ -66,7 +66,7 @@ def compared(results: Results, rows: Sequence[Average]) -> Figure | None:
 
 
 def apart(results: Results, rows: Sequence[Average]) -> set[str]:
-    """Return the groups that have no curve because their rows share no task."""
+    """Return the groups that have no panel because their rows share no task."""
     return {
         group
         for group, own in by_group(rows).items()
@@ -76,7 +76,7 @@ def apart(results: Results, rows: Sequence[Average]) -> set[str]:
 
 
 def validated(results: Results, rows: Sequence[Average]) -> Figure | None:
-    """Draw the mean over each row's tasks, and thin lines for seeds that have all of them."""
+    """Draw the mean over each row's tasks, and a thin line for each seed that has all of them."""
     panels = {}
     for row in rows:
         tasks = list(_runs(results, row).values())
@@ -95,7 +95,7 @@ def validated(results: Results, rows: Sequence[Average]) -> Figure | None:
 def _runs(results: Results, row: Average) -> dict[str, list[Run]]:
     """Return the runs of each of a row's tasks that have a curve.
 
-    These are the finished runs, or if there are none, all that have not failed.
+    These are the finished runs of a task or, if there are none, all that have not failed.
     """
     found = {}
     for task in results.tasks:

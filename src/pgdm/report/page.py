@@ -1,4 +1,4 @@
-"""The report: one self-contained page, with its tables and figures as files next to it."""
+"""Write the report: a self-contained page, with its tables and figures as files next to it."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def write_report(
     Args:
         places: folders, or names of MLflow experiments.
         out: folder to write to; created if missing.
-        progress: reports each step.
-        uri: MLflow store; None: the one in the folder of runs.
+        progress: called with each step.
+        uri: MLflow store; None: the store in the folder of runs.
 
     Returns:
-        The page, and its runs.
+        The page's file, and the results in it.
 
     Raises:
         RunError: if no run can be read, or the folder cannot be written.
@@ -122,7 +122,7 @@ def _pictures(
     out: Path,
     progress: StepProgress,
 ) -> dict[str, Any]:
-    """Draw all figures; return name to figure, or to figures by task, as data URLs."""
+    """Draw all figures; return data URLs by figure name, or by figure name and task."""
     found: dict[str, Any] = {}
     if any(len(run.evaluations["frames"]) for run in results.runs):
         for name, metric in (("curves", SUCCESS), ("curves_error", ERROR)):
@@ -151,7 +151,7 @@ def _pictures(
 
 
 def _films(results: Results, out: Path, progress: StepProgress) -> list[dict[str, Any]]:
-    """Return the videos, each with a thumbnail; the first of each task and setting leads."""
+    """Return the videos with thumbnails; the first of each task and setting has ``leads`` set."""
     found, seen = [], set()
     for run in counted("reading posters", results.runs, progress):
         small = run.video and figures.thumbnail(run.video.with_suffix(".png"))
@@ -165,7 +165,7 @@ def _films(results: Results, out: Path, progress: StepProgress) -> list[dict[str
 
 
 def _provenance(results: Results) -> list[tuple[str, list[tuple[str, int]]]]:
-    """Return versions and assets behind the runs: fact, and its values with numbers of runs."""
+    """Return versions and assets behind the runs: each fact, with its values and their runs."""
     facts: dict[str, Counter[str]] = {}
     for run in results.runs:
         of_run = {
@@ -220,7 +220,7 @@ def _shown(value: float, form: str) -> str:
 
 
 def _between(estimate: Estimate, form: str = ".1%") -> str:
-    """Return an interval as text; empty if there is none."""
+    """Return a confidence interval as text; empty if there is none."""
     if math.isnan(estimate.low):
         return ""
     return f"[{estimate.low:{form}}, {estimate.high:{form}}]"

@@ -29,8 +29,8 @@ class Results:
     """The runs of a report.
 
     Args:
-        runs: all of them; of several with equal setting, task and seed only one counts: a finished
-            one first, then the longest, then the latest.
+        runs: all runs; of several with equal setting, task and seed only one counts, and the others
+            go to ``doubles``: a finished run is preferred, then the longest, then the latest.
     """
 
     def __init__(self, runs: Sequence[Run]) -> None:
@@ -58,7 +58,7 @@ class Results:
         return sorted({run.seed for run in self.runs if run.setting == setting})
 
     def states(self, setting: Setting, task: str) -> dict[int, str]:
-        """Return the state on a task of each seed that the setting has on any task."""
+        """Return each seed's state on a task; ``missing`` for seeds that only other tasks have."""
         there = {run.seed: run.state for run in self.cell(setting, task)}
         return {seed: there.get(seed, "missing") for seed in self.seeds(setting)}
 
@@ -82,7 +82,7 @@ class Results:
 
         Args:
             setting: the setting.
-            groups: config groups that the paper's own table varies too.
+            groups: config groups that the paper's table varies too, and that do not count.
         """
         found = setting.deviations(*groups)
         wanted = setting.option("pregrasp")
@@ -96,7 +96,7 @@ class Results:
 
 
 def known(run: Run, key: str) -> float:
-    """Return the paper's value for a run's task; NaN if it reports none."""
+    """Return the paper's value for a run's task; NaN if the paper reports none."""
     value = run.facts.get(key)
     return float(value) if isinstance(value, int | float) else np.nan
 

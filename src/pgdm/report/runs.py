@@ -44,7 +44,7 @@ MISSING = "missing"
 """State of a run that a sweep has planned but not started."""
 STATES = ("finished", "running", "interrupted", "failed", MISSING)
 TRAIN_POINTS = 100
-"""Approximate number of points of a curve of training."""
+"""Approximate number of points of a training curve."""
 
 Curve = dict[str, NDArray[np.float64]]
 
@@ -62,18 +62,18 @@ class Run:
     task: str
     seed: int
     frames: int
-    """Environment steps done."""
+    """Frames completed."""
     budget: str
     facts: Mapping[str, Any]
     """Facts about the task, from the configuration: ``paper_success``, ``pregrasp_source``..."""
     result: Mapping[str, Any]
     """``result.json``; empty if the run has not written it."""
     metrics: Mapping[str, float]
-    """Metrics of the last evaluation; values that are not finite are left out."""
+    """Metrics of the last evaluation; values that are NaN are left out."""
     evaluations: Curve
-    """``frames`` and each of ``METRICS``, (E,) each."""
+    """``frames`` and each of ``METRICS``, arrays of shape (E,) for E evaluations."""
     training: Curve
-    """``frames`` and ``RETURN``, (about TRAIN_POINTS,)."""
+    """``frames`` and ``RETURN``, arrays of about ``TRAIN_POINTS`` values; may be empty."""
     video: Path | None
     """The last video; its poster is the PNG of the same name."""
     modified: float
@@ -117,7 +117,7 @@ def read_run(folder: RunFolder) -> Run:
 
 
 def planned_run(folder: RunFolder) -> Run:
-    """Return a run that so far has only a configuration."""
+    """Return a run that a sweep has planned: so far it has only a configuration."""
     empty = {"frames": 0, "metrics": {}, "video": None}
     return _run(folder, state=MISSING, evaluations=_curve((), METRICS), training={}, **empty)
 

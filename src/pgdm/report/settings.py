@@ -1,4 +1,4 @@
-"""A run's configuration, all but task and seed, as deviations from the paper's settings."""
+"""A run's configuration, except task and seed, as deviations from the paper's settings."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from pgdm.runs.config_file import dotted
 
 @dataclass(frozen=True)
 class Setting:
-    """All that runs share which differ in task and seed only."""
+    """The configuration shared by runs that differ only in task and seed."""
 
     options: tuple[tuple[str, str], ...]
-    """Config group and chosen option; without the hand if it is the task's own."""
+    """Config group and chosen option; without the hand if it is the task's own hand."""
     changes: tuple[str, ...]
     """Overrides of pgdm's defaults, which are the paper's settings."""
     total_frames: int
@@ -43,12 +43,12 @@ class Setting:
 
     @property
     def plain(self) -> bool:
-        """Whether it is the paper's own method, to which its values by task belong."""
+        """Whether it is PGDM with pre-grasps and no ablation, as in the paper's values by task."""
         return self.method == "pgdm" and self.option("ablation") == "none" and self.with_pregrasp
 
     @property
     def own_hand(self) -> bool:
-        """Whether each task has its own hand, as in the paper."""
+        """Whether each task uses the hand in its file, as in the paper."""
         return not self.within("hand")
 
     def within(self, *groups: str) -> tuple[str, ...]:
@@ -56,7 +56,7 @@ class Setting:
         return tuple(c for c in self.changes if re.split("[.=]", c)[0] in groups)
 
     def rest(self, *groups: str) -> tuple[str, ...]:
-        """Return the changes outside some config groups, and the length."""
+        """Return the changes outside some config groups, and the number of frames as text."""
         own = self.within(*groups)
         return *(c for c in self.changes if c not in own), f"{self.total_frames:,} frames"
 
@@ -64,7 +64,7 @@ class Setting:
         """Return why its results are not comparable with the paper's; empty if they are.
 
         Args:
-            groups: config groups that the paper's own table varies too.
+            groups: config groups that the paper's table varies too, and that do not count.
         """
         frames = self.total_frames
         fewer = [f"{frames:,} of {PAPER_FRAMES:,} frames"] if frames < PAPER_FRAMES else []
@@ -114,7 +114,7 @@ def shared(settings: Sequence[Setting]) -> tuple[str, ...]:
 
 
 def labels(settings: Sequence[Setting]) -> dict[Setting, str]:
-    """Return short names that distinguish settings, without what all have in common."""
+    """Return short names that distinguish settings, without the changes that all of them share."""
     common = shared(settings)
     lengths = {s.total_frames for s in settings}
     found = {}

@@ -1,4 +1,4 @@
-"""Find runs: in folders, which are authoritative, or in an MLflow experiment."""
+"""Find runs in folders or in an MLflow experiment; a run folder takes precedence over MLflow."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def find(places: Sequence[str], uri: str | None, out: Path, progress: StepProgre
 
     Args:
         places: folders, or names of MLflow experiments.
-        uri: MLflow store; None: the one in the folder of runs.
-        out: folder for MLflow's copies of runs whose own folders are not here.
-        progress: reports the runs read.
+        uri: MLflow store; None: the store in the folder of runs.
+        out: folder to which runs are copied from MLflow if their run folders are not here.
+        progress: called with the number of runs read so far.
 
     Raises:
         RunError: if there are no runs.
@@ -76,7 +76,7 @@ def find(places: Sequence[str], uri: str | None, out: Path, progress: StepProgre
     if not folders:
         raise RunError(
             f"no runs in {' '.join(places)}; name a folder that holds some, such as "
-            "`pgdm report runs`, or an MLflow experiment; `pgdm-run` makes runs"
+            "`pgdm report runs`, or an MLflow experiment; `pgdm-run` starts runs"
         )
     return found
 
@@ -92,7 +92,7 @@ def _planned(root: Path, found: Found) -> Iterator[RunFolder]:
                 continue
             config = job["config"] if isinstance(job, dict) else None
             if not isinstance(config, dict) or fault(config, {**CONFIG_KINDS, "run_dir": (str,)}):
-                found.unreadable[str(file)] = "it is damaged; the sweep's command plans it anew"
+                found.unreadable[str(file)] = "it is damaged; the sweep's command writes it again"
                 continue
             folder = RunFolder(file.parent / config.get("run_dir", ""))
             if not (folder.path / CONFIG).exists():
@@ -101,10 +101,10 @@ def _planned(root: Path, found: Found) -> Iterator[RunFolder]:
 
 
 def check_place(name: str, uri: str | None) -> None:
-    """Check that a place is a folder, or that there is an MLflow store to look for it in.
+    """Check that a place is a folder, or that there is an MLflow store that may contain it.
 
     Raises:
-        RunError: if there is neither.
+        RunError: if there is neither a folder nor a store.
     """
     file = sqlite_file(uri or store_uri(paths.runs()))
     if not Path(name).is_dir() and file is not None and not file.exists():
@@ -115,7 +115,7 @@ def check_place(name: str, uri: str | None) -> None:
 
 
 def _of_experiment(name: str, uri: str, out: Path, progress: StepProgress) -> list[RunFolder]:
-    """Return the runs of an MLflow experiment: their own folders, or copies from MLflow."""
+    """Return the runs of an MLflow experiment: their run folders, or copies made from MLflow."""
     check_place(name, uri)
     with one_line_errors(f"MLflow at {uri}"):
         client = connect(uri)
@@ -150,7 +150,7 @@ def _all_runs(client: MlflowClient, experiment_id: str) -> Iterator[MlflowRun]:
 
 
 def _copied(client: MlflowClient, run: MlflowRun, place: Path) -> Path:
-    """Write MLflow's copy of a run as a run folder."""
+    """Write what MLflow has of a run as a run folder, and return it."""
     run_id = run.info.run_id
     folder = paths.inside(place, run_id, kind=f"the run id of {run.info.run_name!r} in MLflow")
     folder.mkdir(parents=True, exist_ok=True)
@@ -173,7 +173,7 @@ def _copied(client: MlflowClient, run: MlflowRun, place: Path) -> Path:
         write_json(folder / RESULT, {"status": status, "frames": frames, **facts})
     (folder / VIDEOS).mkdir(exist_ok=True)
     last = sorted(artifact.path for artifact in client.list_artifacts(run_id, VIDEOS))[-2:]
-    for film in last:  # and its poster, which has its name
+    for film in last:  # the last video, and its poster of the same name
         paths.inside(Path(), *Path(film).parts, kind="a file in MLflow")
         there = Path(client.download_artifacts(run_id, film, str(folder)))
         there.replace(folder / VIDEOS / there.name)
@@ -188,7 +188,7 @@ def _nested(flat: Mapping[str, str]) -> dict[str, Any]:
         inner = nested
         for parent in parents:
             below = inner.setdefault(parent, {})
-            inner = below if isinstance(below, dict) else {}  # a key that is no section, too
+            inner = below if isinstance(below, dict) else {}  # the parent key has a value as well
         try:
             inner[last] = files.parse_json(text.encode())
         except ValueError:

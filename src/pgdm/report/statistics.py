@@ -1,4 +1,4 @@
-"""Statistics over few runs of many tasks, as Agarwal et al. define them.
+"""Statistics over a few runs of many tasks, as Agarwal et al. define them.
 
 "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021: interquartile
 mean, stratified bootstrap, performance profile (Sec. 4.2), probability of improvement (Sec. 4.3).
@@ -69,7 +69,7 @@ def profile(scores: Scores, thresholds: Array, seed: int = 0) -> list[Estimate]:
 
 
 def improvement(x: Scores, y: Scores, seed: int = 0) -> Estimate:
-    """Return the probability that a run of ``x`` beats one of ``y`` on a random task.
+    """Return the probability that a run of ``x`` beats a run of ``y`` on a random task.
 
     1/M sum_m 1/(N_m K_m) sum_n sum_k ([x_mn > y_mk] + [x_mn = y_mk] / 2), for the same tasks in
     the same order.

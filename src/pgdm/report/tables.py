@@ -31,10 +31,10 @@ class Average:
     name: str
     """Row of the table: source of pre-grasps, ablation, or method."""
     group: str
-    """How its setting differs otherwise; only rows with equal groups are comparable. Empty if no
-    row differs."""
+    """How its setting differs in what the table does not vary; only rows with equal groups are
+    comparable. Empty if no row differs."""
     wanted: Callable[[Run], bool]
-    """Whether a run is on one of its tasks."""
+    """Returns whether a run belongs to the row, by its task."""
     tasks: tuple[str, ...]
     """Tasks with a finished run."""
     runs: int
@@ -45,31 +45,31 @@ class Average:
     """The paper's average over the same tasks: ``success`` and ``com_error``; NaN unless the row is
     PGDM with pre-grasps and no ablation, to which the paper's values by task belong."""
     paper: dict[str, float] = field(default_factory=dict)
-    """The paper's own average: ``success``, ``com_error``, and ``tasks`` if stated; empty if the
-    paper has no such row: another method's ablation, other values, another hand."""
+    """The paper's own average: ``success``, ``com_error`` and, if stated, ``ori_error`` and
+    ``tasks``; empty if the paper has no such row, as for another method's ablation."""
     deviations: tuple[str, ...] = ()
-    """Why it is not comparable with the paper."""
+    """Why the row is not comparable with the paper."""
 
     @property
     def hue(self) -> str:
-        """Key for its colour, shared by all groups and by the rows with and without pre-grasp."""
+        """Key of its colour, shared by all groups and by the rows with and without pre-grasp."""
         return self.name.replace(_WITHOUT, _WITH)
 
 
 class Improvement(NamedTuple):
-    """Comparison of a setting with another one on their shared tasks."""
+    """Comparison of a setting with another setting on their shared tasks."""
 
     chance: Estimate
     """Probability that a run of the setting beats one of the other on a random shared task."""
     tasks: int
     runs: int
-    """Runs of the setting on these tasks."""
+    """Number of runs of the setting on the shared tasks."""
     than_runs: int
-    """Runs of the other one."""
+    """Number of runs of the other setting."""
 
     @property
     def single(self) -> bool:
-        """Whether both have a single run per task: then tasks are counted."""
+        """Whether both have a single run per task; the page then counts tasks instead."""
         return self.runs == self.than_runs == self.tasks
 
     @property
@@ -79,7 +79,7 @@ class Improvement(NamedTuple):
 
 
 def by_source(results: Results) -> list[Average]:
-    """Return Table I: each setting of PGDM with pre-grasps and no ablation, by their source."""
+    """Return Table I: rows by pre-grasp source, for each setting of PGDM without ablation."""
     rows = []
     for setting in results.settings:
         if setting.plain:
@@ -90,7 +90,7 @@ def by_source(results: Results) -> list[Average]:
 
 
 def by_ablation(results: Results) -> list[Average]:
-    """Return the ablations on tcdm30, each with its unablated setting; empty if there are none."""
+    """Return the ablations on tcdm30, with the same settings unablated; empty if there are none."""
     ablated = [s for s in results.settings if s.option("ablation") != "none"]
     rests = {setting.rest("ablation") for setting in ablated}
     shown = [setting for setting in results.settings if setting.rest("ablation") in rests]
@@ -144,7 +144,7 @@ def aggregates(results: Results) -> dict[Setting, tuple[Estimate, list[Estimate]
 
 
 def improvements(results: Results) -> dict[tuple[Setting, Setting], Improvement]:
-    """Compare each pair of settings that share tasks, the first with the second."""
+    """Compare the first setting with the second for each pair of settings that share tasks."""
     found = {}
     for a, b in combinations(results.settings, 2):
         x, y = results.scores(a), results.scores(b)
@@ -182,7 +182,7 @@ def _average(
     wanted: Callable[[Run], bool],
     *groups: str,
 ) -> Iterator[Average]:
-    """Yield the row, if any run has finished."""
+    """Yield the row if any of its runs has finished."""
     scores = results.scores(setting, SUCCESS, wanted)
     if not scores:
         return
@@ -214,7 +214,7 @@ def _average(
 
 
 def _from(source: str) -> Callable[[Run], bool]:
-    """Return a test whether a run belongs to a row of Table I, of the paper's 50 tasks only."""
+    """Return a predicate: whether a run of the paper's 50 tasks belongs to a row of Table I."""
 
     def wanted(run: Run) -> bool:
         own = run.facts.get("pregrasp_source")

@@ -31,15 +31,15 @@ class TaskRow:
     fingertips: float
     """Mean distance of the fingertips from the expert's, m; NaN if no run recorded it."""
     contacts: float
-    """Mean distance of the fingertips from the expert's contact points, m; NaN likewise."""
+    """Mean distance of the fingertips from the expert's contact points, m; NaN if not recorded."""
     paper_success: float
     paper_error: float
     null: float
     """Success if the object never moves."""
     rigid_grasp: float
-    """Success that a grasp which never slips would reach; NaN without a wrist plan."""
+    """Success of a grasp that never slips, with the planned commands; NaN without a wrist plan."""
     comparable: bool
-    """Whether the paper's values are comparable."""
+    """Whether the paper's values are comparable with the row's."""
 
     @property
     def difference(self) -> float:
@@ -58,7 +58,7 @@ class TaskRow:
 
     @property
     def idle(self) -> bool:
-        """Whether doing nothing is as good, to the four digits of its known success."""
+        """Whether success, rounded to the four decimals of ``null``, is at most ``null``."""
         return round(self.success, 4) <= self.null
 
     @property

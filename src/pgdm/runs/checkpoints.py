@@ -1,4 +1,4 @@
-"""Which checkpoint of a run is meant, and the policy in it."""
+"""Find a checkpoint of a run, and load the policy in it."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ Array = TypeVar("Array", np.ndarray, torch.Tensor)
 
 
 def find_checkpoint(path: Path, best: bool) -> tuple[Path, Path, State]:
-    """Return the run folder and the checkpoint file that a path means, and the file's contents.
+    """Return the run folder and checkpoint file that a path refers to, and the file's contents.
 
     Args:
-        path: a run's folder, or a checkpoint in one.
-        best: whether to take a run's checkpoint of highest success (then return, with sampled
-            actions), if it has one, instead of its last.
+        path: a run folder, or a checkpoint in one.
+        best: for a run folder, whether to take the checkpoint of highest success (if equal, of
+            highest return) with sampled actions, if there is one, instead of the last.
 
     Raises:
-        RunError: if it is neither.
+        RunError: if ``path`` is neither.
         CheckpointError: if the run has no checkpoint yet, or it is damaged.
     """
     path = located(path)
@@ -47,7 +47,9 @@ def find_checkpoint(path: Path, best: bool) -> tuple[Path, Path, State]:
 
     newest = checkpoints.newest(check)
     if newest is None:
-        raise CheckpointError(f"'{folder}' has no checkpoint yet; pgdm resume {folder} goes on")
+        raise CheckpointError(
+            f"'{folder}' has no checkpoint yet; pgdm resume {folder} continues it"
+        )
     return folder, *newest
 
 
@@ -61,32 +63,32 @@ def _checked(file: Path) -> State:
 
 
 class LoadedPolicy:
-    """The policy of a run, with its statistics of the observations; see `load_policy`."""
+    """The policy of a run, with its observation statistics; see `load_policy`."""
 
     def __init__(self, checkpoint: Path, state: State, seed: int) -> None:
         self._model = policy_of(state, checkpoint)
         self._noise = torch_stream(seed, "policy")
         self.checkpoint = checkpoint
-        """The file it was read from."""
+        """The file from which the policy was read."""
         self.frames = int(state["frames"])
-        """Length of the training before it, environment steps."""
+        """Length of the training up to the checkpoint, frames."""
         self.obs_dim = self._model.cfg.obs_dim
-        """D, numbers in an observation."""
+        """D, the size of an observation."""
         self.action_dim = self._model.cfg.action_dim
-        """A, numbers in an action."""
+        """A, the size of an action."""
 
     def act(self, obs: Array, deterministic: bool = True) -> Array:
         """Return actions for a batch of observations.
 
         Args:
-            obs: (N, D), or (D,) for one, as the environment returns them; NumPy or torch.
+            obs: (N, D), or (D,) for a single one, as the environment returns; NumPy or torch.
             deterministic: return the policy's mean action instead of a sample.
 
         Returns:
             Actions (N, A) or (A,) float32, NumPy or torch as ``obs``.
 
         Raises:
-            ConfigError: if observations have another size: the environment has other settings.
+            ConfigError: if observations are not of size D: the environment has other settings.
         """
         rows = torch.as_tensor(obs, dtype=torch.float32)
         if rows.ndim not in (1, 2) or rows.shape[-1] != self.obs_dim:
@@ -103,14 +105,14 @@ def load_policy(run: str | PathLike[str], *, best: bool = False, seed: int = 0) 
     """Return the policy of a run, to act on batches of observations.
 
     Args:
-        run: a run's folder, or a checkpoint in one.
-        best: whether to take a run's checkpoint of highest success (then return, with sampled
-            actions), if it has one, instead of its last.
-        seed: of the noise of sampled actions.
+        run: a run folder, or a checkpoint in one.
+        best: for a run folder, whether to take the checkpoint of highest success (if equal, of
+            highest return) with sampled actions, if there is one, instead of the last.
+        seed: seed of the noise of sampled actions.
 
     Raises:
-        ConfigError: if ``run`` is no path.
-        RunError: if it is neither.
+        ConfigError: if ``run`` is not a path.
+        RunError: if ``run`` is neither a run folder nor a checkpoint in one.
         CheckpointError: if the run has no checkpoint yet, or it is damaged.
     """
     if not isinstance(run, str | PathLike):

@@ -1,4 +1,4 @@
-"""``config.yaml``, all settings of a run, as plain data; `pgdm.config.saved` has the typed side."""
+"""Read and write ``config.yaml``, a run's settings, as plain data; typed in `pgdm.config.saved`."""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ CONFIG = "config.yaml"
 LOG = "metrics.jsonl"
 RESULT = "result.json"
 LINK = "mlflow.json"
-"""Which MLflow run mirrors this one, and from its start on the values of `pgdm.runs.folder.FACTS`,
-which ``result.json`` has only at the end."""
+"""File that names the MLflow run that mirrors this one. From the start of the run it also has the
+values of `pgdm.runs.folder.FACTS`, which ``result.json`` has only at the end."""
 LOCK = ".lock"
 """Held by the process that trains in the folder."""
 CHECKPOINTS, VIDEOS = "checkpoints", "videos"
@@ -25,7 +25,7 @@ DIVERGED = "diverged"
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object in a file; empty if it is missing, damaged or no object."""
+    """Return the JSON object in a file; {} if the file is missing, damaged or holds no object."""
     try:
         found = files.read_json(path)
     except (OSError, ValueError):
@@ -73,7 +73,7 @@ def _at(content: Any, key: str) -> Any:
 
 
 def fault(content: Mapping[str, Any], kinds: Kinds) -> str | None:
-    """Return what is wrong with the types of a file's content, or None; a key may be missing."""
+    """Return which value in a file's content has a wrong type, or None; keys may be missing."""
     for key, allowed in kinds.items():
         value = _at(content, key)
         if value is not _MISSING and (not isinstance(value, allowed) or isinstance(value, bool)):

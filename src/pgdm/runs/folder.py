@@ -1,4 +1,4 @@
-"""A run folder as others see it: settings, records, result, status; readable in any state."""
+"""A run folder: its settings, records, result and status, which can be read in any state."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from pgdm.runs.files import (
 from pgdm.runs.log import RunLog
 
 PARENT = "parent"
-"""Key in ``mlflow.json``: the MLflow run that this one is shown under, and its store."""
+"""Key in ``mlflow.json``: the MLflow run below which this one is nested, and its store."""
 ARTIFACTS = "mlflow-artifacts"
-"""Folder next to ``mlflow.db`` with MLflow's copies of files; no run is in it."""
+"""Folder next to ``mlflow.db`` with MLflow's copies of files; it is not searched for runs."""
 STATUSES = ("running", "finished", "interrupted", "failed")
 SILENT_S = 600.0
 """Where locks do not work, a run without a result counts as killed once it has written nothing for
@@ -85,7 +85,7 @@ class RunFolder:
 
     @cached_property
     def result(self) -> dict[str, Any]:
-        """Contents of ``result.json``; empty if there is none: the run goes on or was killed.
+        """Contents of ``result.json``; {} if it is missing, since the run continues or was killed.
 
         Raises:
             RunError: if it holds values of wrong types.
@@ -100,12 +100,12 @@ class RunFolder:
 
     @property
     def link(self) -> dict[str, Any]:
-        """Contents of ``mlflow.json``; empty if no MLflow run mirrors this one."""
+        """Contents of ``mlflow.json``; {} if no MLflow run mirrors this one."""
         link = read_json(self.path / LINK)
         return {} if fault(link, LINK_KINDS) else link
 
     def parent(self) -> dict[str, str]:
-        """Return ``run_id`` and ``uri`` of the MLflow run that this one belongs to, or {}."""
+        """Return ``run_id`` and ``uri`` of the MLflow run below which this one is nested, or {}."""
         parent = self.link.get(PARENT)
         return parent if isinstance(parent, dict) else {}
 
@@ -117,18 +117,18 @@ class RunFolder:
         return value
 
     def tags(self) -> dict[str, str]:
-        """Return what identifies the run, as text."""
+        """Return the values of ``TAGS`` and ``FACTS``, folder and host, as text."""
         found = {tag: self.setting(key) for tag, key in TAGS.items()}
         found |= {fact: self.result.get(fact, self.link.get(fact)) for fact in FACTS}
         texts = {name: as_text(value) for name, value in found.items() if value is not None}
         return {**texts, **self.origin()}
 
     def origin(self) -> dict[str, str]:
-        """Return folder and host: other machines may have folders of the same name."""
+        """Return folder and host, since other machines may have folders of the same name."""
         return {"run_dir": str(self.path), "host": socket.gethostname()}
 
     def name(self) -> str:
-        """Return a short name for people, most specific part first: lists cut off its end."""
+        """Return a short display name, most specific part first, since lists cut off the end."""
         tags = self.tags()
         parts = [tags.get("task"), f"s{tags['seed']}" if "seed" in tags else None]
         parts += [tags.get(tag) for tag in ("method", "algo", "action")]
@@ -151,7 +151,7 @@ class RunFolder:
         return self._locked() is True
 
     def _locked(self) -> bool | None:
-        """Return whether a process holds the lock; None if there is none or locks do not work."""
+        """Return whether a process holds the lock; None if there is no lock file or no locking."""
         if not (self.path / LOCK).exists():
             return None
         lock = FileLock(self.path / LOCK)
@@ -165,7 +165,7 @@ class RunFolder:
         return False
 
     def total_frames(self) -> int:
-        """Return the length asked for, environment steps; 0 if unknown."""
+        """Return the requested length, frames; 0 if unknown."""
         total = self.setting("total_frames")
         return total if isinstance(total, int) else 0
 
@@ -198,7 +198,7 @@ class RunFolder:
         return digest.hexdigest()[:16]
 
     def artifacts(self) -> list[tuple[Path, str]]:
-        """Return the files worth a copy elsewhere, each with the subfolder it belongs in."""
+        """Return the files that a tracker should copy, each with its subfolder."""
         plain = [(self.path / name, "") for name in (CONFIG, RESULT, LOG)]
         checkpoints = self.path / CHECKPOINTS
         newest = sorted(checkpoints.glob("frames_*.ckpt"))[-1:]
@@ -210,10 +210,10 @@ class RunFolder:
 
 
 def check_links(run_dir: Path) -> None:
-    """Refuse a run folder in which a link leads out of it: it would be read or written there.
+    """Refuse a run folder with a link that leads out of it, where pgdm would read or write.
 
     Raises:
-        RunError: if there is one.
+        RunError: if there is such a link.
     """
     for folder, subfolders, names in files.walk(run_dir):
         for path in (Path(folder, name) for name in (*subfolders, *names)):
@@ -229,10 +229,10 @@ def holds_run(run_dir: Path, resume: str) -> bool:
 
     Args:
         run_dir: the folder; it may be missing.
-        resume: ``auto``; ``must``, only a run that exists; ``never``, only a new one.
+        resume: ``auto``; ``must`` permits only an existing run, ``never`` only a new one.
 
     Raises:
-        RunError: if ``resume`` forbids it, or the folder holds something other than a run.
+        RunError: if ``resume`` forbids the use, or the folder holds something other than a run.
     """
     if run_dir.exists() and not run_dir.is_dir():
         raise RunError(f"run_dir '{run_dir}' is a file; choose a folder")
@@ -243,7 +243,7 @@ def holds_run(run_dir: Path, resume: str) -> bool:
         return True
     if resume == "must":
         raise RunError(f"'{run_dir}' holds no run and resume=must; check run_dir")
-    # A run that stopped before it wrote its settings may leave the first two files.
+    # A run that stopped before it wrote its settings may leave these two files.
     if run_dir.is_dir() and any(path.name not in (LOCK, LINK) for path in run_dir.iterdir()):
         raise RunError(f"'{run_dir}' is not empty and holds no run; choose another run_dir")
     return False
@@ -259,7 +259,7 @@ def claimed(run_dir: Path) -> Iterator[None]:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         lock = FileLock(run_dir / LOCK)
-        lock.acquire(timeout=0.5)  # listing runs holds it for a moment
+        lock.acquire(timeout=0.5)  # listing runs holds the lock briefly
     except Timeout as error:
         raise RunError(f"another process is using '{run_dir}'; wait for it or stop it") from error
     except OSError as error:
@@ -271,19 +271,19 @@ def claimed(run_dir: Path) -> Iterator[None]:
 
 
 def located(path: Path) -> Path:
-    """Return a path that may be given as `pgdm runs` lists it: below the folder of runs."""
+    """Return a path that may be given relative to the folder of runs, as `pgdm runs` lists it."""
     below = paths.runs() / path
     return below if below.exists() and not path.exists() else path
 
 
 def folder_of(path: Path) -> Path:
-    """Return the run folder that a path means: a run's folder, or a checkpoint in one.
+    """Return the run folder that a path refers to.
 
     Args:
-        path: see ``located``.
+        path: a run folder, or a checkpoint in one; see ``located``.
 
     Raises:
-        RunError: if it is neither.
+        RunError: if ``path`` is neither.
     """
     path = located(path)
     if path.is_file():

@@ -24,7 +24,7 @@ Record = dict[str, float | int | str]
 
 
 class RunLog:
-    """One JSON object per line.
+    """A file of records, one JSON object per line.
 
     A process that dies while writing leaves at most one unfinished last line: readers skip it and
     the next ``append`` removes it. Values that are not finite are stored as ``null`` and read back
@@ -87,7 +87,7 @@ class RunLog:
         Raises:
             RunError: if the file exists but cannot be read.
         """
-        lines = self._raw(size_bytes).split(b"\n")[:-1]  # the first may be the end of a line
+        lines = self._raw(size_bytes).split(b"\n")[:-1]  # the first line may lack its beginning
         return [record for line in lines if (record := _parse(line))]
 
     def _raw(self, last_bytes: int | None = None) -> bytes:
@@ -154,7 +154,7 @@ def _last_of_each(records: Iterable[Record]) -> list[Record]:
     kept: dict[tuple[str, int], Record] = {}
     for record in records:
         key = (str(record["kind"]), int(record["frames"]))
-        kept.pop(key, None)  # the later one takes its own place in the order
+        kept.pop(key, None)  # the later record keeps its position
         kept[key] = record
     return list(kept.values())
 

@@ -1,4 +1,4 @@
-"""Versions and git revision behind a result, and whether a checkpoint fits the present assets."""
+"""Versions and git revision behind a result, and whether a checkpoint fits the current assets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pgdm.errors import RunError
 
-if TYPE_CHECKING:  # they load the simulator and torch
+if TYPE_CHECKING:  # these load the simulator and torch
     from pgdm.envs.build import EnvBuilder
     from pgdm.library.progress import Notify
 
@@ -45,10 +45,10 @@ def git_revision() -> str | None:
 def check_assets(
     recorded: Mapping[str, Any], builder: EnvBuilder, where: Path, notify: Notify
 ) -> None:
-    """Check that a checkpoint was trained with the present assets; report other versions.
+    """Check that a checkpoint was trained with the current assets; report other versions.
 
     Raises:
-        RunError: if it was not; names what differs.
+        RunError: if other assets were used; the message names what differs.
     """
     for difference in builder.differences(recorded):
         raise RunError(
@@ -60,8 +60,8 @@ def check_assets(
     for package in ("mujoco", "torch"):
         if before.get(package) != now[package]:
             notify(
-                f"{where} was trained with {package} {before.get(package)}, this is "
-                f"{now[package]}: from here on the results are not bit-exact"
+                f"{where} was trained with {package} {before.get(package)}, but "
+                f"{now[package]} is installed: from here on the results are not bit-exact"
             )
 
 

@@ -28,8 +28,8 @@ class Recorder(Callback):
         run_dir: folder of the run.
         facts: what the result depends on besides the settings, for ``result.json``.
         open_tracker: opens the tracker of a run folder.
-        film: makes a video of an evaluated policy; raises RenderError if it cannot.
-        notify: called with a sentence if there is no video.
+        film: makes a video of an evaluated policy; raises RenderError on failure.
+        notify: called with a sentence if a video cannot be made.
     """
 
     def __init__(
@@ -50,8 +50,8 @@ class Recorder(Callback):
         """Train, and record how it ends.
 
         Args:
-            trainer: what trains; the settings of this attempt are in the run folder.
-            resumed: whether it starts from a checkpoint: earlier records are then kept.
+            trainer: the trainer; its settings are in the run folder already.
+            resumed: whether training starts from a checkpoint; if so, earlier records are kept.
 
         Raises:
             PgdmError: if the training fails, or its records cannot be written.
@@ -64,13 +64,13 @@ class Recorder(Callback):
             outcome = trainer.run()
             ended = outcome.status, outcome.progress, outcome.evaluation
             write_result(self._folder, *ended, self._facts)
-            # Only now: until the run counts as finished, it is resumed with its replay.
+            # Only now, since a run that is not finished needs its replay to resume.
             if outcome.status == "finished" and not self._folder.setting("keep_replay"):
                 shutil.rmtree(self._run_dir / REPLAY, ignore_errors=True)
             status = outcome.status
             return RunResult.of(self._run_dir)
         except KeyboardInterrupt:
-            status, patience_s = "interrupted", 2.0  # a second Ctrl-C: the user wants to leave now
+            status, patience_s = "interrupted", 2.0  # a second Ctrl-C: exit quickly
             raise
         except (PgdmError, OSError, MemoryError) as error:
             write_result(self._folder, "failed", trainer.progress, {}, self._facts, str(error))

@@ -35,7 +35,7 @@ class RunResult:
     after: dict[str, float]
     """Metrics of the last evaluation."""
     video: Path | None
-    """MP4 of the last evaluated policy, deterministic."""
+    """MP4 of the last evaluated policy, with its mean action."""
     pregrasp_used: str
     """Where episodes started: the configured source, or its fallback."""
 
@@ -59,12 +59,13 @@ class RunResult:
 def is_whole(
     result: Mapping[str, Any], total_frames: int, time_limit_min: float | None = 0.0
 ) -> bool:
-    """Return whether a run is finished and has nothing left to do under the present settings.
+    """Return whether a run is finished and has nothing left to do under the current settings.
 
     Args:
         result: contents of its ``result.json``.
-        total_frames: length asked for now.
-        time_limit_min: limit asked for now, None for no limit; 0 keeps the run's own.
+        total_frames: length that is wanted now, frames.
+        time_limit_min: limit that is wanted now; None for no limit, 0 for the one that ended the
+            run.
     """
     if result.get("status") != "finished":
         return False
@@ -75,22 +76,22 @@ def is_whole(
 
 @dataclass(frozen=True)
 class Reached:
-    """How far a run is."""
+    """Status and progress of a run."""
 
     status: str
     """``finished``, ``interrupted`` or ``failed``."""
     frames: int
     metrics: dict[str, float]
-    """Of the last evaluation; empty if there was none."""
+    """Metrics of the last evaluation; empty if there was none."""
     error: str | None
-    """Why it failed."""
+    """Why the run failed."""
 
 
 def reached(folder: RunFolder, total_frames: int, time_limit_min: float | None = 0.0) -> Reached:
-    """Return how far a run is, by its result or else by its records.
+    """Return a run's status and progress, from its result or, if missing, from its records.
 
-    A run without a result, or with that of a shorter run, counts as interrupted; arguments as for
-    `is_whole`.
+    A run without a result, or with that of a shorter run, counts as interrupted. The arguments are
+    as for `is_whole`.
     """
     result = folder.result
     frames, metrics = result.get("frames"), result.get("metrics")
@@ -121,12 +122,12 @@ def write_result(
     """Write ``result.json``.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         status: ``finished``, ``interrupted`` or ``failed``.
-        progress: how far it came.
-        metrics: of the last evaluation; NaN is left out.
-        facts: what else the result depends on, such as hashes of the assets.
-        error: why it failed.
+        progress: progress when the run ended.
+        metrics: metrics of the last evaluation; NaN is left out.
+        facts: what the result depends on besides the settings, such as hashes of the assets.
+        error: why the run failed.
     """
     records = folder.log.read()
     rates = [float(r["train/steps_per_s"]) for r in records if "train/steps_per_s" in r]
@@ -140,9 +141,9 @@ def write_result(
         "budget": folder.setting("budget"),
         "frames": progress.frames,
         "total_frames": total,
-        # Rounded up: never below the time limit that ended the run.
+        # Rounded up, so that it is never below the time limit that ended the run.
         "wall_time_s": math.ceil(10 * progress.elapsed_s) / 10,
-        # Of collecting and learning only; wall_time_s includes evaluations and videos.
+        # Speed of collecting and learning only; wall_time_s includes evaluations and videos.
         "steps_per_s": round(harmonic_mean(rates), 1) if rates else 0.0,
         "metrics": {name: value for name, value in metrics.items() if not math.isnan(value)},
         "video": str(video.relative_to(folder.path)) if video.exists() else None,

@@ -10,19 +10,19 @@ from pathlib import Path
 class Tracker(ABC):
     """A mirror of a run. Only ``log`` is mandatory.
 
-    No method may block for long or raise because the mirror is out of reach: the run folder is
-    the record, and a mirror can be rebuilt from it.
+    No method may block for long or raise because the mirror is unreachable: the run folder is the
+    record, and the mirror can be rebuilt from it.
     """
 
     @abstractmethod
     def log(self, metrics: Mapping[str, float], frames: int) -> None:
-        """Record metrics at a number of frames (environment steps, all simulations together)."""
+        """Record metrics at a number of frames (control steps, all simulations together)."""
 
     def video(self, path: Path, poster: Path, frames: int) -> None:  # noqa: B027 (optional)
         """Keep an MP4 of the policy after ``frames``, and its poster picture."""
 
     def finish(self, status: str, patience_s: float = 60.0) -> None:  # noqa: B027 (optional)
-        """Close the record with status ``finished``, ``interrupted`` or ``failed``.
+        """Close the mirror with status ``finished``, ``interrupted`` or ``failed``.
 
         Called once, after the last file of the run folder (``result.json``) is written, so that
         files can be copied. Must return within ``patience_s``.

@@ -1,1 +1,1 @@
-"""Many experiments as one: what is planned, what was done, and what is left to do."""
+"""Sweeps: many runs planned, driven and monitored as one."""

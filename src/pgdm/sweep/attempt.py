@@ -1,4 +1,4 @@
-"""One attempt at one job of a sweep, in the process that does the work."""
+"""One attempt at a job of a sweep, as run by the worker process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pgdm.sweep.processes import Process
 from pgdm.sweep.queue import requeue
 from pgdm.sweep.status import run_ending
 
-if TYPE_CHECKING:  # it loads the simulator and torch
+if TYPE_CHECKING:  # the schema loads the simulator and torch
     from pgdm.config.schema import ExperimentCfg
 
 _PR_SET_PDEATHSIG = 1  # Linux, sys/prctl.h
@@ -30,29 +30,29 @@ _HANDOVER_S = 60.0
 _log = logging.getLogger(__name__)
 
 Train = Callable[["ExperimentCfg", bool], int]
-"""Trains, ignoring further signals after the first if the flag is set; returns the exit code."""
+"""Trains with given settings, ignoring further stop signals if flagged; returns the exit code."""
 
 
 def stop_with_parent() -> None:
-    """Have this process save and stop if its parent dies: nobody would see how it exits."""
+    """Have Linux stop this process with SIGTERM, so that it saves, when its parent dies."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def attempt(
     folder: Path, key: str, number: int, threads: int, slurm_id: str | None, train: Train
 ) -> int:
-    """Work on a job, and return the exit code of its run.
+    """Train the run of a job, and return its exit code.
 
     Args:
         folder: folder of the sweep.
         key: key of the job.
         number: number of the attempt.
-        threads: number of threads of a job that does not set it itself.
-        slurm_id: Slurm's ID of the job that this process is, if it is one.
-        train: does the run.
+        threads: number of threads if the job's settings leave ``num_threads`` at 0.
+        slurm_id: ID of the Slurm job in which this process runs; None outside Slurm.
+        train: trains with the given settings.
 
     Raises:
-        PgdmError: if the attempt was given up meanwhile, or the run fails.
+        PgdmError: if the ledger has closed the attempt before it began, or the run fails.
     """
     if not Ledger(folder).register(key, number, Process.of(os.getpid()), slurm_id):
         raise SweepError("this attempt was given up before it began")
@@ -65,16 +65,16 @@ def attempt(
 
 
 def _train_in_slurm(cfg: ExperimentCfg, slurm_id: str, train: Train) -> int:
-    """Do a run; if it is displaced but has made progress, have Slurm start it again."""
+    """Train; if Slurm stops the run early but it has made progress, have Slurm requeue it."""
     folder = Path(cfg.run_dir)
     limit = time.monotonic() + _HANDOVER_S
-    while RunFolder(folder).busy and time.monotonic() < limit:  # on a node that was given up
+    while RunFolder(folder).busy and time.monotonic() < limit:  # an earlier process is saving
         time.sleep(1.0)
     before = run_ending(folder, cfg.total_frames).frames or 0
     code = train(cfg, True)
     if code in STOPPED and (run_ending(folder, cfg.total_frames).frames or 0) > before:
         try:
             requeue(slurm_id)
-        except SweepError as error:  # not allowed here: the sweep's own process does it
-            _log.warning("not queued again: %s", error)
+        except SweepError as error:  # users may not requeue here: the driver starts a new attempt
+            _log.warning("cannot requeue this job: %s", error)
     return code

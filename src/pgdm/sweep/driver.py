@@ -1,4 +1,4 @@
-"""Drives the jobs of a sweep from one process: starts workers and follows each to its end."""
+"""The driver of a sweep: one process that starts the workers and records how each ended."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ from pgdm.sweep.repair import holds, job_ending, recall
 from pgdm.sweep.status import NAME, PARENT, SLOTS, is_alive, log_path, run_ending, settle
 
 _STOP_S = 60.0
-"""How long workers may take to save when the sweep itself fails."""
+"""How long workers may take to save when the driver fails."""
 _RETRY_S = 60.0
-"""How long to wait after a launcher has refused jobs, while others run."""
+"""How long to wait before trying again if jobs could not be started while others run."""
 
 
 @dataclass
 class _Worker:
-    """A process that works on a job, or is about to."""
+    """A process that works on a job, or waits in Slurm to do so."""
 
     assignment: Assignment
     frames: int
-    """Frames of the job when this driver started the worker or took it over."""
+    """Frames that the run had completed when this driver started or adopted the worker."""
     asked: bool = False
-    """Whether it was asked to stop."""
+    """Whether the worker was asked to stop."""
 
 
 class Driver:
@@ -55,7 +55,7 @@ class Driver:
 
     Args:
         plan: the jobs.
-        max_attempts: how often a job is tried.
+        max_attempts: how many times a job is tried before it counts as failed.
         launcher: starts workers.
         front: shows the sweep's state to the user.
     """
@@ -95,13 +95,13 @@ class Driver:
             self._notify(text)
         if self._workers:
             self._notify(
-                "the jobs continue without this process; the same command monitors them again, "
-                f"pgdm sweep cancel {self._plan.folder} stops them"
+                "the jobs continue without this process; run the same command to monitor them "
+                f"again, or pgdm sweep cancel {self._plan.folder} to stop them"
             )
         return stop.exit_code if stopped else int(not whole)
 
     def _prepare(self) -> None:
-        """Bring the ledger in line with the run folders, and open the sweep in MLflow."""
+        """Reconcile the ledger with the run folders, and open the sweep's MLflow run."""
         ledger, me = self._ledger, Process.of(os.getpid())
         recall(ledger, self._plan)
         ledger.set_fact(NAME, self._plan.name)
@@ -120,7 +120,7 @@ class Driver:
         ledger.set_states(states)
 
     def _adopt(self, entry: Entry, attempt: Attempt) -> None:
-        """Follow a worker that another driver has left, or at least wait for its exit."""
+        """Monitor a worker left by an earlier driver, or else only wait until it is gone."""
         job = self._jobs.get(entry.key)
         if job is not None and self._launcher.adopt(
             assignment := Assignment(job, attempt.number), attempt
@@ -131,7 +131,7 @@ class Driver:
             self._left_over.append(entry)
 
     def _first_state(self, entry: Entry) -> str:
-        """Return whether a job is finished or waits; the folder decides, not the ledger."""
+        """Return FINISHED or WAITING: a job is finished only if its run folder says so."""
         job = self._jobs[entry.key]
         done = job_ending(job).state == FINISHED
         known = entry.state == FINISHED or (done and holds(job))
@@ -143,7 +143,7 @@ class Driver:
             if stop() and self._launcher.stays:
                 return
             if stop():
-                self._left_over.clear()  # they have been stopping since their own driver died
+                self._left_over.clear()  # they stop by themselves, since their driver died
             self._take_over()
             states = self._ledger.states()
             self._ask(
@@ -159,14 +159,14 @@ class Driver:
             time.sleep(self._launcher.tick_s)
 
     def _ask(self, workers: Sequence[_Worker]) -> None:
-        """Ask workers to save and stop, each of them once."""
+        """Ask workers to save and stop, unless they were asked before."""
         if assignments := [worker.assignment for worker in workers if not worker.asked]:
             self._launcher.ask(assignments)
         for worker in workers:
             worker.asked = True
 
     def _is_free(self, job: Job) -> bool:
-        """Return whether no other process works in a job's folder; report a busy one once."""
+        """Return whether a job's run folder is free; report once if another process uses it."""
         busy = RunFolder(Path(job.cfg.run_dir)).busy
         if busy and job.key not in self._reported_busy:
             self._reported_busy.add(job.key)
@@ -188,12 +188,12 @@ class Driver:
             return
         for assignment in assignments:
             if self._tries[assignment.job.key] >= self._max_attempts:
-                self._tries[assignment.job.key] = 0  # used up, so `sweep retry` set it to waiting
+                self._tries[assignment.job.key] = 0  # `pgdm sweep retry` reset the job
             self._tries[assignment.job.key] += 1
             self._workers.append(_Worker(assignment, _frames(assignment.job)))
 
     def _refused(self, assignments: Sequence[Assignment], error: SweepError) -> None:
-        """Note that workers could not be started; while others run, try again later."""
+        """Record that workers could not be started; try again later if others run, else raise."""
         for assignment in assignments:
             found = job_ending(assignment.job)
             self._ledger.end(*assignment.id, replace(found, state=FAILED, error=str(error)))
@@ -204,7 +204,7 @@ class Driver:
         self._not_before_s = time.monotonic() + _RETRY_S
 
     def _reap(self) -> None:
-        """Find the workers that have exited, and note how."""
+        """Record how each worker that has exited ended, and update the state of its job."""
         found = [(worker, self._launcher.ended(worker.assignment)) for worker in self._workers]
         for worker, ended in found:
             if ended is None:
@@ -228,7 +228,7 @@ class Driver:
             self._ledger.set_states({key: state})
 
     def _ending(self, worker: _Worker, ended: Ended) -> Ending:
-        """Return how an attempt ended, from run folder, exit code and log."""
+        """Return how an attempt ended, according to run folder, exit code and log."""
         code, job = ended.code, worker.assignment.job
         found = job_ending(job)
         if found.state == FINISHED and holds(job):
@@ -244,7 +244,7 @@ class Driver:
         return Ending(state, code, found.frames, found.metrics, error)
 
     def _take_over(self) -> None:
-        """Take over the jobs of a killed driver once the workers that it left have exited."""
+        """Take over the jobs of an earlier driver whose workers have exited by now."""
         for entry in list(self._left_over):
             assert entry.last is not None
             if is_alive(entry.last, entry.run_dir, self._launcher.queue):
@@ -260,7 +260,7 @@ class Driver:
 
 
 def _frames(job: Job) -> int:
-    """Return how far a job is, frames."""
+    """Return the number of frames that a job's run has completed."""
     return job_ending(job).frames or 0
 
 

@@ -1,4 +1,4 @@
-"""What a plan will cost, from its progress so far and the speed of earlier runs."""
+"""Estimate the remaining time of a plan from its progress and the speed of earlier runs."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from pgdm.sweep.plan import Job, Plan
 from pgdm.sweep.status import run_ending
 
 _NEWEST = 50
-"""Most earlier runs to look at."""
+"""How many of the newest earlier runs to look at."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """How much is left of a plan."""
+    """The remaining work of a plan."""
 
     finished: int
-    """Jobs that are finished."""
+    """Number of finished jobs."""
     begun: int
-    """Jobs that were begun, and will resume."""
+    """Number of jobs that were begun and will resume."""
     frames_left: int
-    """Frames left."""
+    """Frames left, over all jobs."""
     steps_per_s: float
-    """Speed of a job that runs alone, collecting and learning."""
+    """Training speed of one job, collection and learning included [frames/s]."""
     measured_runs: int
-    """Earlier runs in which the speed was measured; 0: it is assumed."""
+    """Number of earlier runs from which the speed is taken; 0 if it is assumed."""
 
     @property
     def hours(self) -> float:
-        """Time for the rest, one job after the other [h]."""
+        """Remaining time if the jobs run one after the other [h]."""
         return self.frames_left / self.steps_per_s / 3600
 
 
 def estimate(plan: Plan, root: Path, progress: StepProgress = silent) -> Estimate:
-    """Estimate from the run folders of a plan, and from earlier runs in a folder.
+    """Estimate the remaining work from the run folders of a plan and from earlier runs.
 
     Args:
         plan: the jobs.
-        root: folder of runs.
+        root: folder in which earlier runs are looked for.
         progress: called with the number of jobs looked at so far.
     """
     done = []
@@ -69,13 +69,13 @@ def _frames_done(job: Job) -> int:
     total = job.cfg.total_frames
     try:
         found = run_ending(Path(job.cfg.run_dir), total, job.cfg.time_limit_min)
-    except RunError:  # reported when it starts
+    except RunError:  # the job reports it when it starts
         return 0
     return total if found.state == FINISHED else min(found.frames or 0, total - 1)
 
 
 def _speeds(plan: Plan, root: Path) -> list[float]:
-    """Return the steps a second of the earlier runs most similar to the plan's."""
+    """Return the speed, in frames/s, of the earlier runs most similar to the plan's."""
     runs = [run for run in find_runs(root) if (run.path / RESULT).exists()]
     runs.sort(key=lambda run: (run.path / RESULT).stat().st_mtime)
     rows = []
@@ -87,7 +87,7 @@ def _speeds(plan: Plan, root: Path) -> list[float]:
         (j.cfg.algo.name, j.cfg.num_envs, j.cfg.device, j.cfg.action.kind, j.cfg.task.id)
         for j in plan.jobs
     }
-    # The same task or not, but never another algorithm, width or device.
+    # Task and action kind may differ; algorithm, number of simulations and device may not.
     for length in (5, 4, 3):
         alike = {kind[:length] for kind in kinds}
         found = [speed for kind, speed in rows if kind[:length] in alike]

@@ -1,4 +1,4 @@
-"""From overrides with several values to the settings of every job."""
+"""Expand overrides with several values into the settings of every job."""
 
 from __future__ import annotations
 
@@ -20,34 +20,35 @@ Tasks = Callable[[Sequence[str]], Sequence[str]]
 """Maps words, each a task, a suite or a pattern, to the tasks that they name."""
 
 Composed = tuple[tuple[str, ...], dict[str, Any]]
-"""Overrides of a job, and the settings that they lead to."""
+"""The overrides of a job, and the settings composed from them."""
 
 
 def with_tasks_as_choices(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides with a single value for ``task`` written as one of several.
+    """Return the overrides with ``task=NAME`` rewritten as ``task=choice(NAME)``.
 
-    Hydra composes single values before a sweep is expanded, and no option has a suite's name.
+    Hydra composes single values before it expands a sweep, and would fail if NAME is a suite or a
+    pattern, which are not options of the group ``task``.
     """
     plain = re.compile(r"task=(?!null$)([^,()]+)")
     return [plain.sub(r"task=choice(\1)", o) if plain.fullmatch(o) else o for o in overrides]
 
 
 def grid(overrides: Sequence[Override], tasks: Tasks, most: int) -> list[tuple[str, ...]]:
-    """Return the overrides of each job: every combination of the values, the last key fastest.
+    """Return the overrides of each job: all combinations of values, the last key varying fastest.
 
     Args:
-        overrides: parsed overrides; of two for the same key the later one counts.
-        tasks: what the words given for ``task`` mean.
-        most: how many jobs there may be.
+        overrides: parsed overrides; a later override of the same key replaces an earlier one.
+        tasks: expands the values given for ``task``.
+        most: maximum number of jobs.
 
     Raises:
-        ConfigError: if a key has no value to try, or an interval of numbers, or there are too many
+        ConfigError: if a key has no value to try or an interval of numbers, or there are too many
             jobs.
     """
     axes: dict[str, list[str]] = {}
     for override in overrides:
         key = override.get_key_element()
-        # An earlier one may have stood elsewhere; the order of first mention stays.
+        # A key keeps the position of its first override, even if a later one replaces its values.
         axes[key] = [f"{key}={value}" for value in _values(override, tasks, most)]
         if (count := math.prod(map(len, axes.values()))) > most:
             raise ConfigError(
@@ -81,14 +82,14 @@ def composed_jobs(
     """Return the settings of every job of a sweep.
 
     Args:
-        composer: over the folders of settings.
-        overrides: overrides of the sweep, with several values where wanted.
-        config_dir: the user's own settings folder, for tasks and suites.
+        composer: composes the settings.
+        overrides: overrides of the sweep, each with one or several values.
+        config_dir: the user's settings folder, searched for tasks and suites.
         progress: called with the number of jobs composed so far.
-        most: how many jobs there may be.
+        most: maximum number of jobs.
 
     Raises:
-        ConfigError: if a value is not what ``grid`` takes, or the settings of a job are wrong.
+        ConfigError: as for ``grid``, or if the settings of a job are wrong.
     """
     jobs = grid(composer.parse(overrides), lambda words: expand_tasks(words, config_dir), most)
     common = set(jobs[0]).intersection(*jobs)

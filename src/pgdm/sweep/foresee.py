@@ -1,4 +1,4 @@
-"""What the runs of a sweep lack in this machine's assets, reported before any of them starts."""
+"""Report which assets the runs of a sweep lack on this machine, before any of them starts."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from pgdm.pregrasp.sources import stored_source
 def foresee(
     cfgs: Sequence[ExperimentCfg], library: Library, progress: StepProgress = silent
 ) -> list[str]:
-    """Return sentences on start states and assets that differ from what the runs ask for.
+    """Return a sentence for each kind of start state or asset that is missing or replaced.
 
     Args:
         cfgs: settings of the runs.
-        library: nothing is fetched or generated for it here.
+        library: the assets on this machine; nothing is fetched or generated here.
         progress: called with the number of runs looked at so far.
 
     Raises:
-        ConfigError: if a start state is missing, and is not generated automatically.
+        ConfigError: if a start state is missing and cannot be generated automatically.
     """
     replaced: Counter[tuple[str, str]] = Counter()
     used_by: dict[object, str] = {}
@@ -45,21 +45,22 @@ def foresee(
             if used_by[start] != source:
                 replaced[source, used_by[start]] += 1
     found = [
-        f"{count} runs with pregrasp={source} start from '{used}', as the assets here have no "
-        f"'{source}' for their tasks (a TCDM checkout has, or 'pgdm pregrasp reach TASK' plans one)"
+        f"{count} runs with pregrasp={source} start from '{used}', since no '{source}' start is "
+        "stored here for their tasks (a TCDM checkout has it, or 'pgdm pregrasp reach TASK' "
+        "plans it)"
         for (source, used), count in replaced.items()
     ]
     if planned:
         found.append(
-            f"{len(planned)} tasks have a wrist plan: a run whose plan the library lacks "
-            "computes it first, 10-40 s each"
+            f"{len(planned)} tasks need a wrist plan; a run whose plan the library lacks "
+            "computes it first, which takes 10-40 s"
         )
     if lacking:
         names = ", ".join(sorted(lacking))
         found.append(f"only a TCDM checkout has these tasks, and none was imported here: {names}")
     if approximate:
         names = ", ".join(sorted(approximate))
-        found.append(f"the expert hands of these tasks are rebuilt, and approximate: {names}")
+        found.append(f"the experts of these tasks are reconstructed and only approximate: {names}")
     return found
 
 
@@ -67,7 +68,7 @@ def _used(cfg: ExperimentCfg, library: Library) -> str:
     """Return the source of the start state that a run will use.
 
     Raises:
-        ConfigError: if there is none; the message names the command that generates one.
+        ConfigError: if there is no start state; the message names the command that generates it.
     """
     source = cfg.pregrasp.source
     used = stored_source(cfg.pregrasp, library.motion(cfg.task.motion), cfg.task.id, cfg.hand.name)

@@ -13,10 +13,10 @@ from pgdm.sweep.queue import Queue
 
 
 class View(AbstractContextManager["View"], Protocol):
-    """A display of a sweep; a context."""
+    """A display of a sweep's state, used as a context manager."""
 
     def update(self) -> None:
-        """Show the current state, unless that was done a moment ago."""
+        """Refresh the display, unless that was done a moment ago."""
         ...
 
     def line(self) -> str:
@@ -30,13 +30,13 @@ class View(AbstractContextManager["View"], Protocol):
 
 @dataclass(frozen=True)
 class Front:
-    """The command line, as far as a sweep uses it."""
+    """What a sweep uses of the command line."""
 
     notify: Notify
     view: Callable[[str, Ledger, Queue], View]
-    """Makes a display from a sweep's name, its ledger and its jobs in Slurm."""
+    """Creates a display from a sweep's name, its ledger and its jobs in Slurm."""
     worker: tuple[str, ...]
-    """Command of a worker; the sweep's folder, the job's key, the number of the attempt and the
-    threads follow, and in Slurm the ID of its job."""
+    """Command that starts a worker; to be followed by the sweep's folder, the job's key, the number
+    of the attempt, the number of threads and, in Slurm, the Slurm job's ID."""
     resume: tuple[str, ...]
-    """Command that resumes a sweep; its folder follows."""
+    """Command that resumes a sweep; to be followed by the sweep's folder."""

@@ -1,4 +1,4 @@
-"""A sweep from its plan to its exit code, here or in the background."""
+"""Start a sweep, in this process or in the background."""
 
 from __future__ import annotations
 
@@ -24,22 +24,23 @@ from pgdm.sweep.slurm import SlurmLauncher, check_slurm
 from pgdm.sweep.status import LOGS, parent
 
 LAUNCH = "launch.json"
-"""File in the sweep's folder: how the sweep was started last."""
+"""File in the sweep's folder that records how the sweep was last started."""
 OUTPUT = "sweep.log"
-"""File among the logs: output of a sweep in the background."""
+"""File in the log folder with the output of a sweep that runs in the background."""
 LOCK = ".lock"
 _POLL_S = 0.1
 
 
 def run_sweep(plan: Plan, sweep: SweepCfg, launcher: LauncherCfg, front: Front) -> int:
-    """Do what is left of a sweep, and return the exit code.
+    """Run the unfinished jobs of a sweep, and return the exit code.
 
-    0: every job is finished; 1: not every one; 130 or 143: stopped by a signal.
+    0: every job is finished, or the sweep runs in the background; 1: some jobs are not finished;
+    130 or 143: stopped by a signal.
 
     Args:
         plan: the jobs; its folder may hold them in any state.
-        sweep: how often a job is tried, and whether to run in the background.
-        launcher: where they run, and how many at a time.
+        sweep: how many times a job is tried, and whether to run in the background.
+        launcher: where the jobs run, and how many at a time.
         front: the command line.
 
     Raises:
@@ -66,10 +67,10 @@ def _launcher(plan: Plan, cfg: LauncherCfg, front: Front) -> Launcher:
 
 
 def launched(plan: Plan) -> tuple[SweepCfg, LauncherCfg]:
-    """Return how a sweep was started last.
+    """Return the settings with which a sweep was last started.
 
     Raises:
-        SweepError: if that is unknown.
+        SweepError: if they were not recorded.
     """
     known = read_json(plan.folder / LAUNCH)
     try:
@@ -77,17 +78,17 @@ def launched(plan: Plan) -> tuple[SweepCfg, LauncherCfg]:
         return build(SweepCfg, known["sweep"]), build(LAUNCHERS[launcher["name"]], launcher)
     except (KeyError, ConfigError) as error:
         raise SweepError(
-            f"{plan.folder / LAUNCH} does not record how the sweep was started; start it by its "
-            f"own command: {plan.command}"
+            f"{plan.folder / LAUNCH} does not record how the sweep was started; start it with its "
+            f"original command: {plan.command}"
         ) from error
 
 
 @contextlib.contextmanager
 def held(plan: Plan) -> Iterator[None]:
-    """Keep other processes from driving the sweep.
+    """Hold the sweep's lock, so that no other process drives the sweep.
 
     Raises:
-        SweepError: if another process does already.
+        SweepError: if another process holds the lock.
     """
     lock = FileLock(plan.folder / LOCK)
     try:
@@ -96,7 +97,7 @@ def held(plan: Plan) -> Iterator[None]:
         other = parent(Ledger(plan.folder))
         who = f"process {other.pid}" if other else "another process"
         raise SweepError(
-            f"sweep '{plan.name}' is run by {who} already; watch it with pgdm sweep watch "
+            f"sweep '{plan.name}' is already run by {who}; watch it with pgdm sweep watch "
             f"{plan.folder}, stop it with pgdm sweep cancel {plan.folder}"
         ) from error
     try:
@@ -106,7 +107,7 @@ def held(plan: Plan) -> Iterator[None]:
 
 
 def _detach(plan: Plan, front: Front) -> int:
-    """Resume the sweep in a session of its own, and return once it runs."""
+    """Start the sweep in a background process, and return once it runs."""
     output = plan.folder / LOGS / OUTPUT
     with open(output, "ab") as log:
         child = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""The contract between what drives a sweep and what starts its workers."""
+"""The interface between a sweep's driver and the launcher that starts its workers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pgdm.sweep.queue import Queue
 
 @dataclass(frozen=True)
 class Assignment:
-    """One attempt at a job, done by a process of its own."""
+    """One attempt at a job, to be made by one worker."""
 
     job: Job
     number: int
@@ -21,7 +21,7 @@ class Assignment:
 
     @property
     def id(self) -> tuple[str, int]:
-        """Its identity: key of the job and number of the attempt."""
+        """Key of the job and number of the attempt."""
         return self.job.key, self.number
 
 
@@ -30,39 +30,39 @@ class Ended:
     """How a worker exited."""
 
     code: int | None
-    """Its exit code, or minus the signal that killed it; None if unknown."""
+    """Exit code, or the negative number of the signal that killed the worker; None if unknown."""
     error: str | None = None
-    """What killed it, if anything did."""
+    """What ended the worker, unless it exited by itself."""
     displaced: bool = False
-    """Whether it was preempted or ran out of time, which is no failure."""
+    """Whether Slurm preempted the worker or its time ran out; neither counts as a failure."""
 
 
 class Launcher(Protocol):
-    """Starts workers somewhere, and learns how they exit."""
+    """Starts workers, and reports how they exit."""
 
     slots: int
     """How many jobs run at a time."""
     tick_s: float
-    """Time between two looks at the workers, s."""
+    """Interval at which the driver checks the workers, s."""
     stays: bool
     """Whether workers continue when their driver exits."""
     queue: Queue
-    """States of the workers on a Slurm cluster."""
+    """States of the user's jobs in Slurm."""
 
     def more(self, working: int) -> int:
-        """Return how many jobs may be started in addition to those that run."""
+        """Return how many more jobs may be started while ``working`` jobs run."""
         ...
 
     def start(self, assignments: Sequence[Assignment]) -> None:
         """Start workers.
 
         Raises:
-            SweepError: if they cannot be started; none of them has been.
+            SweepError: if they cannot be started; then none of them was.
         """
         ...
 
     def adopt(self, assignment: Assignment, attempt: Attempt) -> bool:
-        """Follow a worker that another driver has left, and return whether that is possible."""
+        """Monitor a worker left by an earlier driver; return False if that is impossible."""
         ...
 
     def ended(self, assignment: Assignment) -> Ended | None:
@@ -74,5 +74,5 @@ class Launcher(Protocol):
         ...
 
     def end(self, patience_s: float) -> None:
-        """Stop all workers that do not stay; kill those that take longer than this to save, s."""
+        """Stop all workers unless ``stays``; kill those that still run after ``patience_s``."""
         ...

@@ -29,7 +29,7 @@ STATES = (WAITING, RUNNING, FINISHED, FAILED, INTERRUPTED, CANCELLED)
 LOCK_S = 120.0
 """How long to retry when the ledger is locked, s."""
 
-# With a rollback journal: a write-ahead log needs memory that all writers share.
+# The default rollback journal stays: a write-ahead log needs shared memory, and so a single host.
 _SCHEMA = """
 BEGIN IMMEDIATE;
 CREATE TABLE IF NOT EXISTS jobs (
@@ -55,7 +55,7 @@ class Attempt:
 
     key: str
     number: int
-    """Counts from 1."""
+    """Counted from 1."""
     state: str
     process: Process
     start: float
@@ -66,10 +66,10 @@ class Attempt:
     frames: int | None = None
     """Progress of the run at the attempt's end, frames."""
     metrics: Mapping[str, float] | None = None
-    """The run's last evaluation."""
+    """Metrics of the run's last evaluation."""
     error: str | None = None
     slurm_id: str | None = None
-    """Slurm's ID of its job, if it is one."""
+    """ID of the Slurm job that makes the attempt; None outside Slurm."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Ending:
 class Ledger:
     """The ledger of the sweep in a folder; the file is created if it is missing.
 
-    Each method is one transaction. While the ledger is locked, it retries for ``LOCK_S``.
+    Each method is one transaction. If the file is locked, it is retried for up to ``LOCK_S``.
 
     Args:
         folder: folder of the sweep.
@@ -113,7 +113,7 @@ class Ledger:
         self._do(lambda db: db.executescript(_SCHEMA) if _is_empty(db) else None)
 
     def add(self, plan: Plan) -> None:
-        """Add a plan's jobs; known ones keep their state and attempts."""
+        """Add a plan's jobs; those already in the ledger keep their state and attempts."""
         rows = [
             (job.key, place, job.name, run_dir_in(self.folder, job), job.cfg.total_frames)
             for place, job in enumerate(plan.jobs)
@@ -143,7 +143,7 @@ class Ledger:
         return dict(self._read("SELECT key, state FROM jobs"))
 
     def attempts(self) -> list[Attempt]:
-        """Return all attempts in order."""
+        """Return all attempts, ordered by job key and number."""
         return [_attempt(row) for row in self._read("SELECT * FROM attempts ORDER BY key, number")]
 
     def begin(self, key: str, process: Process) -> int:
@@ -157,7 +157,7 @@ class Ledger:
                 "FROM attempts WHERE key = ?1 RETURNING number",
                 (key, process.host, process.pid, process.born, time.time()),
             ).fetchall()
-            # Cancelled meanwhile: its driver sees that, and stops it.
+            # A job cancelled meanwhile stays cancelled: the driver then stops its worker.
             db.execute(
                 "UPDATE jobs SET state = 'running' WHERE key = ? AND state != 'cancelled'", (key,)
             )
@@ -167,8 +167,9 @@ class Ledger:
         return self._do(work)
 
     def submitted(self, slurm_ids: Mapping[tuple[str, int], str]) -> None:
-        """Record which of Slurm's jobs are which attempts, each by key and number."""
-        # So far their process is the driver; one that runs already has registered itself.
+        """Record the Slurm job ID of each attempt, which is given by job key and number."""
+        # Until now the driver is recorded as their process. An attempt that already runs has
+        # registered its process and Slurm job ID itself.
         self._write(
             "UPDATE attempts SET slurm_id = ?, host = '', pid = 0, born = '' "
             "WHERE key = ? AND number = ? AND slurm_id IS NULL",
@@ -178,7 +179,7 @@ class Ledger:
     def register(
         self, key: str, number: int, process: Process, slurm_id: str | None = None
     ) -> bool:
-        """Record which process works on an attempt; false if it was given up meanwhile."""
+        """Record which process makes an attempt; return False if the attempt is already closed."""
         changed = self._write(
             "UPDATE attempts SET host = ?, pid = ?, born = ?, slurm_id = ? "
             "WHERE key = ? AND number = ? AND state = 'running'",
@@ -187,7 +188,7 @@ class Ledger:
         return changed == 1
 
     def end(self, key: str, number: int, ending: Ending) -> None:
-        """Record how an attempt ended; an earlier record of that stays."""
+        """Record how an attempt ended, unless that is recorded already."""
         found = ending.exit_code, ending.frames, json.dumps(ending.metrics), ending.error
         self._write(
             "UPDATE attempts SET state = ?, end = ?, exit_code = ?, frames = ?, metrics = ?, "
@@ -196,7 +197,7 @@ class Ledger:
         )
 
     def recall(self, key: str, start: float, end: float, ending: Ending) -> None:
-        """Record a past attempt that is only known from its run folder."""
+        """Record a past attempt that is known only from its run folder."""
         row = (key, ending.state, start, end, ending.frames, json.dumps(ending.metrics))
         self._write(
             "INSERT OR IGNORE INTO attempts (key, number, state, host, pid, born, start, end, "
@@ -234,7 +235,7 @@ class Ledger:
         return self._do(work)
 
     def _do(self, work: Callable[[sqlite3.Connection], T]) -> T:
-        """Do work on a connection of its own, so that nothing stays open."""
+        """Call ``work`` with a new connection and close it; retry while the file is locked."""
         limit = time.monotonic() + LOCK_S
         while True:
             try:
@@ -252,13 +253,13 @@ class Ledger:
 
 
 def run_dir_in(folder: Path, job: Job) -> str:
-    """Return a job's folder as stored: relative if inside, so that a sweep can be moved."""
+    """Return a job's run folder as stored: relative if below ``folder``, which may then move."""
     path = Path(job.cfg.run_dir)
     return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    # Short waits inside SQLite, so that a second Ctrl-C is noticed.
+    # A short timeout, since Python handles no Ctrl-C while SQLite waits.
     return sqlite3.connect(path, timeout=0.5, isolation_level=None)
 
 
@@ -274,7 +275,7 @@ def _explained(path: Path, error: sqlite3.Error) -> str:
             "of the jobs is in their run folders)"
         )
     if isinstance(error, sqlite3.OperationalError):
-        return f"cannot use {path}: {text}; check that its folder exists and may be written"
+        return f"cannot use {path}: {text}; check that its folder exists and is writable"
     return f"{path} is damaged ({text}); remove it, and it is rebuilt from the run folders"
 
 

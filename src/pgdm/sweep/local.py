@@ -1,4 +1,4 @@
-"""Workers on this machine: a process for each job, as many at a time as fit."""
+"""Workers on this machine: one process per job, as many at a time as cores and memory allow."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ class Room:
     slots: int
     """Jobs at a time."""
     threads: int
-    """Threads of each job that does not set them itself."""
+    """Threads of each job whose settings leave ``num_threads`` at 0."""
 
 
 def room(plan: Plan, launcher: LocalCfg, cores: int, memory_gb: float) -> Room:
     """Return how the jobs of a plan share a machine.
 
-    It follows from the whole plan, not from what is left of it.
+    All jobs of the plan count, whether finished or not.
 
     Args:
         plan: the jobs.
-        launcher: limits.
+        launcher: settings of the launcher.
         cores: number of cores of the machine.
         memory_gb: free memory, GB.
     """
@@ -52,8 +52,8 @@ class LocalLauncher:
 
     Args:
         plan: the jobs.
-        cfg: limits.
-        worker: command of a worker, see ``Front``.
+        cfg: settings of the launcher.
+        worker: command that starts a worker, see ``Front``.
     """
 
     tick_s, stays = 0.2, False
@@ -66,11 +66,11 @@ class LocalLauncher:
         self._asked: set[tuple[str, int]] = set()
 
     def more(self, working: int) -> int:
-        """Return how many places are free."""
+        """Return how many slots are free."""
         return self.slots - working
 
     def start(self, assignments: Sequence[Assignment]) -> None:
-        """Start a process for each."""
+        """Start a process for each assignment."""
         for assignment in assignments:
             place = [
                 str(self._folder),
@@ -86,11 +86,11 @@ class LocalLauncher:
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=subprocess.STDOUT,
-                    start_new_session=True,  # Ctrl-C reaches only the driver, which asks workers
+                    start_new_session=True,  # Ctrl-C reaches only the driver, which stops workers
                 )
 
     def adopt(self, assignment: Assignment, attempt: Attempt) -> bool:
-        """Refuse: only its parent learns how a process exits."""
+        """Return False: only the parent of a process learns how it exits."""
         del assignment, attempt
         return False
 
@@ -113,7 +113,7 @@ class LocalLauncher:
         self._asked |= ids
 
     def end(self, patience_s: float) -> None:
-        """Stop processes; kill those that do not exit in time, with all their children."""
+        """Stop all processes; kill those that do not exit in time, with their children."""
         if patience_s:
             self._ask(self._processes.keys())
         limit = time.monotonic() + patience_s

@@ -1,4 +1,4 @@
-"""A sweep in MLflow: one run with its jobs nested below it. MLflow never stops a sweep."""
+"""A sweep in MLflow: one MLflow run with the jobs' runs nested below it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 class SweepMirror:
-    """Mirrors a sweep to MLflow; reports a failure of MLflow once, and the sweep continues.
+    """Mirrors a sweep to MLflow; if MLflow fails, it reports that once and the sweep continues.
 
     Args:
-        group: the sweep's run; None mirrors nothing.
+        group: the sweep's MLflow run; None mirrors nothing.
         notify: called with a sentence if MLflow fails.
     """
 
@@ -32,7 +32,7 @@ class SweepMirror:
 
     @classmethod
     def of(cls, plan: Plan, notify: Notify) -> SweepMirror:
-        """Return the mirror of a plan, in the store of its first job that uses MLflow."""
+        """Return the mirror of a plan, in the MLflow store of its first job that uses MLflow."""
         chosen = next((j.cfg.tracking for j in plan.jobs if j.cfg.tracking.kind == "mlflow"), None)
         if chosen is None:
             return cls(None, notify)
@@ -42,7 +42,7 @@ class SweepMirror:
         known = str(read_json(plan.folder / LINK).get("uri", ""))
         file = sqlite_file(known)
         stays = is_own(known, plan.folder) and file is not None and file.exists()
-        # In the database of all runs if the sweep is among them, otherwise in its own folder.
+        # A sweep below the folder of runs is kept in their database, any other in its own folder.
         runs = paths.runs().absolute()
         here = store_uri(runs if plan.folder.is_relative_to(runs) else plan.folder)
         uri = chosen.uri or (known if stays else here)
@@ -54,8 +54,8 @@ class SweepMirror:
 
         Args:
             folder: folder of the sweep.
-            dead: run folders whose workers were found dead; the sweep may have been closed before.
-            status: how the sweep ended, if it is still running according to MLflow.
+            dead: run folders of workers that were found dead.
+            status: how the sweep ended; recorded if MLflow still has it as running.
             notify: called with a sentence if MLflow fails.
         """
         link = read_json(folder / LINK)
@@ -68,7 +68,7 @@ class SweepMirror:
         uri = str(link["uri"])
         if not is_own(uri, folder):
             notify(
-                f"MLflow at {uri} is left as it is: `pgdm runs sync --uri {uri}` corrects its runs"
+                f"MLflow at {uri} was not changed; `pgdm runs sync --uri {uri}` corrects its runs"
             )
             return
         mirror = cls(Group(folder, uri, link["experiment"]), notify)
@@ -78,7 +78,7 @@ class SweepMirror:
             mirror.close(status)
 
     def open(self, plan: Plan) -> None:
-        """Create the sweep's run, before any job starts."""
+        """Create the sweep's MLflow run, and nest below it the runs that exist already."""
         self._plan = plan
         self._tell(lambda group: group.open(plan.name, {"command": plan.command}))
         for job in plan.jobs:
@@ -86,13 +86,13 @@ class SweepMirror:
                 self.adopt(job)
 
     def adopt(self, job: Job) -> None:
-        """Nest a job below its sweep, if the job uses MLflow."""
+        """Nest a job's MLflow run below the sweep's, if the job uses MLflow."""
         if job.cfg.tracking.kind == "mlflow":
             self._tell(lambda group: group.adopt(Path(job.cfg.run_dir)))
 
     def correct(self, run_dir: Path) -> None:
-        """Give a run that was killed its true status."""
-        if self._failed:  # no waiting for each job: `pgdm runs sync` does this too
+        """Correct the status of a run that was killed."""
+        if self._failed:  # do not wait for MLflow at every job: `pgdm runs sync` corrects it later
             return
         self._tell(lambda group: group.correct(run_dir))
 

@@ -1,4 +1,4 @@
-"""The plan of a sweep: its jobs, each a checked experiment with an identity and a folder."""
+"""The plan of a sweep: its jobs, each a checked experiment with a key and a run folder."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class SweepCfg:
     dir: str | None
     """Folder of the sweep; None is ``runs/sweeps/<name>``."""
     max_attempts: int
-    """How often a job is tried, each time the sweep is started, before it counts as failed."""
+    """How many times a job is tried per start of the sweep before it counts as failed."""
     detach: bool
     """Run in the background, and return immediately."""
     dry_run: bool
     """Print the plan, and start nothing."""
     most_jobs: int
-    """How many jobs a sweep may have."""
+    """Maximum number of jobs of a sweep."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class LocalCfg:
     max_jobs: int
     """Most jobs at a time; 0: as many as cores and memory allow."""
     cores_per_job: int
-    """Threads of each job; 0: the cores divided by the jobs."""
+    """Threads of a job that leaves ``num_threads`` at 0; 0: as many as the largest ``num_threads``
+    of the other jobs or, if all are 0, the cores divided by the jobs at a time."""
     memory_per_job_gb: float
     """Memory to allow for each job [GB]."""
 
@@ -71,7 +72,7 @@ class SlurmCfg:
     constraint: str | None
     """Features that nodes must have; None: any node."""
     time_min: int
-    """Time limit; a job that reaches it saves, and resumes in Slurm's queue [min]."""
+    """Time limit of a Slurm job, which saves shortly before it and is requeued [min]."""
     cores_per_job: int
     """Cores, and threads, of each job."""
     memory_per_job_gb: float
@@ -106,8 +107,8 @@ def read_launcher(choice: str, settings: object) -> LauncherCfg:
     """Return the checked settings of a launcher.
 
     Args:
-        choice: its option in ``hydra/launcher``.
-        settings: composed settings.
+        choice: option chosen for ``hydra/launcher``.
+        settings: composed settings of the launcher.
 
     Raises:
         ConfigError: if there is no such launcher, or a setting is wrong.
@@ -119,8 +120,8 @@ def read_launcher(choice: str, settings: object) -> LauncherCfg:
     check_above_zero("hydra.launcher.memory_per_job_gb", cfg.memory_per_job_gb)
     if not isinstance(cfg, LocalCfg) and cfg.signal_delay_s >= 60 * cfg.time_min:
         raise ConfigError(
-            f"hydra.launcher.signal_delay_s is {cfg.signal_delay_s}, and the time limit "
-            f"time_min only {cfg.time_min} minutes; choose a longer one"
+            f"hydra.launcher.signal_delay_s is {cfg.signal_delay_s}, but the time limit "
+            f"time_min is only {cfg.time_min} minutes; choose a longer time limit"
         )
     return cfg
 
@@ -132,11 +133,11 @@ class Job:
     key: str
     """16 hex digits, a hash of every setting that changes the result."""
     name: str
-    """What distinguishes it from the others, such as ``task=cup-pour1 seed=1``."""
+    """What distinguishes the job from the others, such as ``task=cup-pour1 seed=1``."""
     overrides: tuple[str, ...]
-    """All of its overrides, enough to compose it again."""
+    """All overrides of the job, from which its settings can be composed again."""
     cfg: ExperimentCfg
-    """The experiment; ``cfg.run_dir`` is its own folder, absolute."""
+    """The settings; ``cfg.run_dir`` is the run folder, absolute."""
 
 
 @dataclass(frozen=True)
@@ -150,18 +151,18 @@ class Plan:
     jobs: tuple[Job, ...]
     """No two have the same key."""
     command: str
-    """What was typed."""
+    """The command line as typed."""
 
 
 def job_key(cfg: ExperimentCfg) -> str:
     """Return 16 hex digits, equal for two experiments that have the same result."""
-    # The length belongs to a result, though a longer run may resume a shorter one's folder.
+    # An identity omits total_frames, so that a longer run can resume a shorter one; a key has it.
     whole = identity(cfg) | {"total_frames": cfg.total_frames}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def record(plan: Plan) -> None:
-    """Write ``plan.json`` with the jobs of a plan added to those that it has already.
+    """Add the jobs of a plan to those in its ``plan.json``.
 
     Raises:
         SweepError: as for ``check_fits``.
@@ -171,10 +172,10 @@ def record(plan: Plan) -> None:
 
 
 def check_fits(plan: Plan) -> tuple[Job, ...]:
-    """Return the jobs that the folder of a plan holds already; none of them may have changed.
+    """Return the jobs already recorded in a plan's folder, checked for changed settings.
 
     Raises:
-        SweepError: if a job of the same name had other settings; the message is the difference.
+        SweepError: if a job of the same name had other settings; the message lists the differences.
     """
     if not (plan.folder / PLAN).exists():
         return ()
@@ -237,12 +238,14 @@ def read_job(folder: Path, key: str) -> Job:
 
 @contextmanager
 def _opened(folder: Path) -> Iterator[dict[str, Any]]:
-    """Give the content of ``plan.json``, and explain what is wrong with it."""
+    """Yield the content of ``plan.json``; raise errors in it as a SweepError that explains them."""
     file = folder / PLAN
     try:
         whole = files.read_json(file)
         if whole["format"] != FORMAT:
-            raise SweepError(f"{file} has the format of another pgdm; choose another sweep.name")
+            raise SweepError(
+                f"{file} has the format of another pgdm version; choose another sweep.name"
+            )
         yield whole
     except FileNotFoundError as error:
         raise SweepError(f"'{folder}' holds no sweep: it has no {PLAN}") from error
@@ -250,10 +253,12 @@ def _opened(folder: Path) -> Iterator[dict[str, Any]]:
         raise SweepError(f"cannot read {file}: {files.reason(error)}") from error
     except ConfigError as error:
         raise SweepError(
-            f"{file} was written by a pgdm with other settings ({error}); choose another sweep.name"
+            f"{file} does not fit the settings of this pgdm ({error}); choose another sweep.name"
         ) from error
     except (ValueError, LookupError, TypeError) as error:
-        raise SweepError(f"{file} is damaged ({error}); remove it to plan anew") from error
+        raise SweepError(
+            f"{file} is damaged ({error}); remove it, and plan the sweep again"
+        ) from error
 
 
 def _job(entry: Mapping[str, Any], folder: Path) -> Job:

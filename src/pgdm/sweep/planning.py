@@ -1,4 +1,4 @@
-"""From composed settings to a plan; every job is checked before any starts."""
+"""Turn composed settings into a plan; every job is checked before any starts."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def make_plan(
     """Check the settings of every job, and return the plan and notes for the user.
 
     Args:
-        composed: the jobs.
+        composed: overrides and settings of each job.
         sweep: settings of the sweep.
-        name: its name if ``sweep.name`` has none.
-        command: what was typed.
+        name: name of the sweep if ``sweep.name`` is null.
+        command: the command line as typed.
         progress: called with the number of jobs checked so far.
 
     Raises:
@@ -44,7 +44,7 @@ def make_plan(
     folder = (paths.runs() / "sweeps" / name if sweep.dir is None else Path(sweep.dir)).absolute()
     jobs: dict[str, Job] = {}
     notes: list[str] = []
-    stores: list[str] = []  # a sentence for each job
+    stores: list[str] = []  # notes on the MLflow store, one per job
     for (overrides, settings), job_name in zip(composed, _names(composed), strict=True):
         cfg = _placed(_checked(settings, job_name), settings.get("run_dir"), folder)
         cfg = dataclasses.replace(cfg, tracking=located(cfg.tracking, stores.append))
@@ -60,7 +60,7 @@ def make_plan(
 
 
 def _names(composed: Sequence[Composed]) -> list[str]:
-    """Return what distinguishes each job from the others, also from those of other commands."""
+    """Return each job's name: task, seed, and those of its overrides that differ between jobs."""
     given = [
         {key.lstrip("+"): value for key, _, value in (o.partition("=") for o in overrides)}
         for overrides, _ in composed
@@ -70,7 +70,7 @@ def _names(composed: Sequence[Composed]) -> list[str]:
     others = [key for key in varied if key.partition(".")[0] not in NOT_IN_A_NAME]
     names = []
     for one, (_, settings) in zip(given, composed, strict=True):
-        # Not checked yet: both may be missing.
+        # The settings are not checked yet: task and seed may be missing.
         task = settings.get("task")
         ends = {
             "task": task.get("id") if isinstance(task, dict) else None,
@@ -89,9 +89,9 @@ def _checked(settings: Mapping[str, Any], name: str) -> ExperimentCfg:
 
 
 def _placed(cfg: ExperimentCfg, run_dir: str | None, folder: Path) -> ExperimentCfg:
-    """Place a run in the folder of the sweep, unless it has a folder of its own."""
+    """Place a run in the folder of the sweep, unless the user has set ``run_dir``."""
     if run_dir is None:
-        inner = Path(cfg.run_dir).relative_to("runs")  # the default
+        inner = Path(cfg.run_dir).relative_to("runs")  # the default run_dir
         return dataclasses.replace(cfg, run_dir=str(folder / "runs" / "-".join(inner.parts)))
     return dataclasses.replace(cfg, run_dir=str(Path(run_dir).absolute()))
 

@@ -1,4 +1,4 @@
-"""PIDs are reused; a process is identified by PID and start time."""
+"""Processes, identified by PID and start time, since PIDs are reused."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Process:
     host: str
     pid: int
     born: str
-    """Its start: the machine's boot ID and clock ticks since then; empty if unknown."""
+    """Its start time: the machine's boot ID and the clock ticks since boot; empty if unknown."""
 
     @classmethod
     def of(cls, pid: int) -> Process:
@@ -49,7 +49,7 @@ class Process:
 
 
 def _born(pid: int) -> str:
-    """Return when a process started; empty if there is none, or only a zombie."""
+    """Return when a process started; empty if there is no such process, or only a zombie."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         boot = _BOOT.read_text()[:8]

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from pgdm.errors import SweepError
 
 GONE, UNKNOWN = "GONE", "UNKNOWN"
-"""States of our own: Slurm has no such job (any more), or cannot be queried."""
+"""Two states besides Slurm's: Slurm has no such job (any more), or cannot be queried."""
 _PENDING = ("PENDING", "REQUEUED", "REQUEUE_FED", "REQUEUE_HOLD", "RESV_DEL_HOLD", "SPECIAL_EXIT")
 _ENDED = (
     *("BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY"),
     *("PREEMPTED", "REVOKED", "TIMEOUT", GONE),
 )
+# Beginnings of the reasons for which Slurm never starts a pending job.
 _STUCK = (
     *("accountnotallowed", "badconstraints", "dependencyneversatisfied", "invalidaccount"),
     *("invalidqos", "jobholdmaxrequeue", "launch failed", "partitionnodelimit"),
@@ -41,7 +42,7 @@ class Standing:
 
     @property
     def alive(self) -> bool:
-        """Whether it runs or will run; assumed if Slurm cannot be queried."""
+        """Whether it runs or will run; True if Slurm cannot be queried."""
         return self.state not in _ENDED
 
     @property
@@ -56,7 +57,7 @@ class Standing:
 
     @property
     def exit_code(self) -> int:
-        """Exit code, or minus the signal that killed it."""
+        """Exit code, or the negative number of the signal that killed it."""
         return self.status >> 8 or -(self.status & 0x7F)
 
 
@@ -64,7 +65,7 @@ class Queue:
     """The user's jobs in Slurm, cached for a short time.
 
     Args:
-        interval_s: how old an answer may be, s.
+        interval_s: maximum age of a cached answer, s.
     """
 
     def __init__(self, interval_s: float = 10.0) -> None:
@@ -85,12 +86,12 @@ class Queue:
         return self._found.get(slurm_id, Standing(GONE))
 
     def forget(self) -> None:
-        """Query Slurm at the next call: something has changed."""
+        """Have the next ``find`` query Slurm, since jobs were submitted."""
         self._asked_s = -math.inf
 
     @property
     def silent_s(self) -> float:
-        """Time since Slurm stopped answering, s."""
+        """Time since Slurm's last answer, s; 0 if the last query was answered."""
         return 0.0 if self._found is not None else time.monotonic() - self._answered_s
 
     def _ask(self) -> None:
@@ -103,7 +104,7 @@ class Queue:
 
 
 def parse(text: str) -> dict[str, Standing]:
-    """Return what ``squeue`` printed, by Slurm's id of each job."""
+    """Parse the output of ``squeue`` into a mapping from Slurm job ID to state."""
     found = {}
     for line in text.splitlines():
         slurm_id, state, status, reason = line.split(None, 3)
@@ -117,14 +118,14 @@ def cancel(slurm_ids: Iterable[str]) -> None:
         if ids := list(slurm_ids):
             output(["scancel", "--quiet", *ids])
     except SweepError as error:
-        if "Invalid job id" not in str(error):  # it has ended long ago
+        if "Invalid job id" not in str(error):  # such a job ended long ago
             raise
 
 
 def requeue(slurm_id: str) -> None:
     """Have Slurm queue this job again, unless it is being cancelled.
 
-    Called inside the job, which has saved because its time is up or it is preempted.
+    Called by the job itself, after it has saved because its time is up or it is preempted.
     """
     state = output(["squeue", "--noheader", "--jobs", slurm_id, "--format=%T"]).strip()
     if state in ("RUNNING", "SIGNALING"):
@@ -135,7 +136,7 @@ def output(command: list[str]) -> str:
     """Run one of Slurm's commands, and return its output.
 
     Raises:
-        SweepError: if it is missing, fails or does not answer.
+        SweepError: if the command is missing, fails or does not answer.
     """
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_ANSWER_S)

@@ -1,4 +1,4 @@
-"""Brings a sweep's ledger, and MLflow with it, in line with the run folders."""
+"""Reconcile a sweep's ledger and its records in MLflow with the run folders."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pgdm.sweep.mirror import SweepMirror
 from pgdm.sweep.queue import Queue
 from pgdm.sweep.status import PLAN, parent, run_ending, settle
 
-if TYPE_CHECKING:  # it loads the simulator and torch
+if TYPE_CHECKING:  # these load the simulator and torch
     from pgdm.sweep.ledger import Ending
     from pgdm.sweep.plan import Job, Plan
 
@@ -22,7 +22,7 @@ def repaired(folder: Path, queue: Queue | None, notify: Notify) -> Ledger:
     """Return a sweep's ledger after correcting what killed processes left in it and in MLflow.
 
     A ledger that is missing or empty is rebuilt from the run folders. While a process drives the
-    sweep, nothing is changed: that process does it.
+    sweep, nothing else is changed, since that process makes the corrections.
 
     Args:
         folder: folder of the sweep.
@@ -48,7 +48,7 @@ def repaired(folder: Path, queue: Queue | None, notify: Notify) -> Ledger:
 
 
 def recall(ledger: Ledger, plan: Plan) -> None:
-    """Note a plan's jobs in a ledger, and for jobs without attempts what their folders hold."""
+    """Add a plan's jobs to a ledger; for jobs without attempts, record what their folders hold."""
     ledger.add(plan)
     jobs = {job.key: job for job in plan.jobs}
     for entry in ledger.entries():
@@ -61,16 +61,16 @@ def recall(ledger: Ledger, plan: Plan) -> None:
 
 
 def job_ending(job: Job) -> Ending:
-    """Return how far a job's run is."""
+    """Return the status and progress of a job's run, from its folder."""
     return run_ending(Path(job.cfg.run_dir), job.cfg.total_frames, job.cfg.time_limit_min)
 
 
 def holds(job: Job) -> bool:
-    """Return whether a job's folder holds its run, and not another one."""
+    """Return whether a job's run folder holds the run of this job, and not another run."""
     from pgdm.config.saved import load_config
     from pgdm.sweep.plan import job_key
 
     try:
         return job_key(load_config(job.cfg.run_dir)) == job.key
     except (RunError, ConfigError):
-        return False  # its worker reports what is wrong
+        return False  # the job's worker reports what is wrong

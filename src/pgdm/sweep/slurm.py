@@ -1,8 +1,8 @@
-"""Workers as jobs of a Slurm cluster: one array for all that are started together.
+"""Workers as jobs of a Slurm cluster: one job array for all that are started together.
 
-An attempt is one of Slurm's jobs. A worker that is preempted or runs out of time saves and has
-Slurm queue the same job again; after a node failure Slurm does so itself. Either way the attempt
-continues, and needs no driver.
+An attempt is one Slurm job. A worker that is preempted or runs out of time saves and has Slurm
+requeue the same job; after a node failure Slurm does so by itself. In both cases the attempt
+continues without a driver.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pgdm.sweep.queue import GONE, Queue, cancel
 from pgdm.sweep.status import LOGS, log_path
 
 _OUTPUT = "slurm"
-"""Folder among the logs with submitit's files and the output of Slurm's jobs."""
+"""Folder inside the log folder with submitit's files and the output of Slurm's jobs."""
 _PASSED_ON = ("partition", "account", "qos", "constraint", "gres", "signal_delay_s")
 _DISPLACED = ("PREEMPTED", "TIMEOUT")
 _EXITED = ("COMPLETED", "FAILED")
@@ -32,7 +32,7 @@ _SILENT_S = 3600.0
 
 
 def check_slurm() -> None:
-    """Check that Slurm is installed here.
+    """Check that Slurm is installed on this machine.
 
     Raises:
         SweepError: if not.
@@ -76,8 +76,8 @@ class SlurmLauncher:
 
     Args:
         plan: the jobs.
-        cfg: what each gets.
-        worker: command of a worker, see ``Front``.
+        cfg: what each job gets.
+        worker: command that starts a worker, see ``Front``.
     """
 
     tick_s, stays = 1.0, True
@@ -90,14 +90,14 @@ class SlurmLauncher:
         self._slurm_ids: dict[tuple[str, int], str] = {}
 
     def more(self, working: int) -> int:
-        """Return how many jobs may be submitted: all, or none while Slurm has enough.
+        """Return how many jobs may be submitted: all, or none if ``slots`` jobs are working.
 
-        Slurm enforces the limit within one array, the driver across arrays.
+        Slurm enforces that limit within an array, and this method across arrays.
         """
         return len(self._plan.jobs) if working < self.slots else 0
 
     def start(self, assignments: Sequence[Assignment]) -> None:
-        """Submit one array."""
+        """Submit the jobs as one array."""
         from submitit import SlurmExecutor
         from submitit.core.utils import FailedJobError, FailedSubmissionError
 
@@ -170,11 +170,11 @@ def _reason(text: str) -> str:
 
 
 def _become(command: tuple[str, ...]) -> None:
-    """Replace this process, one of Slurm's jobs, by a worker, whose exit code Slurm then sees."""
+    """Replace this process, a Slurm job, with a worker, so that Slurm sees its exit code."""
     from submitit import JobEnvironment
 
-    # Until the run listens there is nothing to save. submitit would queue the job again without
-    # saving, and logs signals wherever the program is, even in the middle of an import.
+    # Ignore signals until the run handles them: before that there is nothing to save. submitit's
+    # handlers would requeue the job without saving, and log even in the middle of an import.
     for number in (signal.SIGUSR2, signal.SIGTERM, signal.SIGCONT):
         signal.signal(number, signal.SIG_IGN)  # inherited by the worker
     sys.stdout.flush()

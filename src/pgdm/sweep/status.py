@@ -1,7 +1,7 @@
 """The state of each job of a sweep.
 
-It is read from the ledger; for an attempt that the ledger calls running, also from the run folder
-or Slurm.
+It is read from the ledger and, for an attempt that the ledger has as running, from the run folder
+or Slurm as well.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Row:
     key: str
     name: str
     state: str
-    """Verified: ``running`` only if its process lives, or Slurm runs it."""
+    """Verified: ``running`` only if its process is alive, or Slurm runs it."""
     attempts: int
     frames: int
     """Frames of the run so far; while the job runs, up to its last record."""
@@ -63,13 +63,13 @@ class Row:
     frames_per_s: float | None
     """Speed over the whole run so far, evaluations included; None if unknown."""
     left_s: float | None
-    """Remaining time at that pace; None unless the job runs."""
+    """Remaining time at ``frames_per_s``; None unless the job runs."""
     run_dir: Path
     log: Path | None
     """Output of the last attempt."""
     error: str | None
     slurm: str | None
-    """ID and state in Slurm of an attempt that the ledger calls running, such as
+    """ID and state in Slurm of an attempt that the ledger has as running, such as
     ``12_3 PENDING (Resources)``; else None."""
 
 
@@ -82,16 +82,16 @@ class Summary:
     frames: int
     total_frames: int
     left_s: float | None
-    """Remaining time at the present pace; None if unknown."""
+    """Remaining time at the current speed; None if unknown."""
 
 
 def run_ending(run_dir: Path, total_frames: int, time_limit_min: float | None = 0.0) -> Ending:
-    """Return how far a run is, from its folder; a run that was killed counts as interrupted.
+    """Return a run's status and progress, from its folder; a killed run counts as interrupted.
 
     Args:
         run_dir: its folder.
-        total_frames: length that is wanted now.
-        time_limit_min: limit that is wanted now, None for no limit; 0 keeps the run's own.
+        total_frames: length that is wanted now, frames.
+        time_limit_min: limit that is wanted now; None: no limit, 0: the one that ended the run.
     """
     found = reached(RunFolder(run_dir), total_frames, time_limit_min)
     return Ending(found.status, None, found.frames, found.metrics, found.error)
@@ -150,12 +150,12 @@ def summarize(found: Sequence[Row], slots: int) -> Summary:
     """
     counted = Counter(row.state for row in found)
     rates = [row.frames_per_s for row in found if row.frames_per_s]
-    # A whole number of iterations may exceed the wanted length.
+    # A run ends with a whole iteration, and so may exceed the wanted length.
     remaining = [max(row.total_frames - row.frames, 0) for row in found if row.state in _LEFT]
     left_s = 0.0 if not remaining else None
     if remaining and rates:
         rate = sum(rates) / len(rates)
-        # The longest job cannot be divided.
+        # At least the time of the longest job, which cannot be divided between slots.
         left_s = max(sum(remaining) / min(max(slots, 1), len(remaining)), max(remaining)) / rate
     return Summary(
         {state: counted[state] for state in STATES if counted[state]},
@@ -212,7 +212,7 @@ def _row(folder: Path, entry: Entry, queue: Queue) -> Row:
 
 
 def _in_slurm(attempt: Attempt, run_dir: Path, queue: Queue) -> tuple[str | None, bool]:
-    """Return an attempt's ID and state in Slurm, if it has any, and whether it waits to start."""
+    """Return an attempt's ID and state in Slurm, or None, and whether it waits to start."""
     if attempt.slurm_id is None:
         return None, False
     found = queue.find(attempt.slurm_id)

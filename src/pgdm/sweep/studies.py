@@ -1,4 +1,4 @@
-"""Studies: sweeps stored as files, with what one would type after ``pgdm-run -m``."""
+"""Studies: sweeps stored as files that hold the overrides to type after ``pgdm-run -m``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pgdm.paths import as_name
 
 _KEY = "+sweep"
 
-# Settings of which jobs run, where, how fast or how often; they do not distinguish studies.
+# Settings that say which jobs run, where, how fast or how often; names of sweeps omit them.
 NOT_IN_A_NAME = (
     "task", "seed", "sweep", "hydra", "run_dir", "resume", "offline", "num_threads", "device",
     "tracking", "checkpoint",
@@ -23,8 +23,8 @@ NOT_IN_A_NAME = (
 
 
 def studies(config_dir: str | Path | None = None) -> dict[str, Path]:
-    """Return the sweep files by name; for a name that pgdm and the user have, pgdm's file."""
-    # Next to conf/, in a checkout as in an installed package.
+    """Return the sweep files by name; pgdm's file comes before a user's of the same name."""
+    # pgdm's are next to conf/, both in a checkout and in an installed package.
     places = [conf_dir().parent, *folders(config_dir)[1:]]
     own_last = [file for folder in places for file in (folder / "sweeps").glob("*.yaml")]
     return dict(sorted((file.stem, file) for file in reversed(own_last)))
@@ -37,7 +37,7 @@ def open_study(
 
     Returns:
         The name of the sweep file, None if there is none; the other overrides; and the overrides
-        in the file, which come before those.
+        in the file, which must be applied before the others.
 
     Raises:
         UnknownNameError: if there is no such sweep file.
@@ -58,14 +58,14 @@ def open_study(
 
 
 def default_name(overrides: Sequence[str], study: str | None) -> str:
-    """Return the name of a sweep without ``sweep.name``.
+    """Return the name of a sweep for which ``sweep.name`` is not set.
 
     It depends on the sweep file and the overrides, but neither on tasks nor on seeds: a command
-    with more of these extends the same sweep.
+    with more tasks or seeds extends the same sweep.
 
     Args:
         overrides: overrides as typed.
-        study: name of the sweep file.
+        study: name of the sweep file, if any.
     """
     given = {o.partition("=")[0]: o.partition("=")[2] for o in overrides}
     rest = {
@@ -99,7 +99,7 @@ def _read(file: Path) -> list[str]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: {files.reason(error)}") from error
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        raise ConfigError(f"{file} is no sweep file; write lines such as task: tcdm30")
+        raise ConfigError(f"{file} is not a sweep file; write lines such as task: tcdm30")
     check_settings(content, str(file))
     return [f"{key}={_value(value, file)}" for key, value in content.items()]
 

@@ -16,7 +16,7 @@ __all__ = ["TRACKERS", "NullTracker", "Tracker", "TrackingCfg", "located", "open
 
 @dataclass(frozen=True)
 class TrackingCfg:
-    """Where a run is mirrored to; its own folder is complete without it."""
+    """Where a run is mirrored; the run folder is complete without the mirror."""
 
     kind: str
     """``mlflow`` or ``none``."""
@@ -45,7 +45,7 @@ def located(cfg: TrackingCfg, notify: Callable[[str], object]) -> TrackingCfg:
     """Return a configuration with the absolute address of the store that the user names, if any.
 
     Args:
-        cfg: as the user wrote it.
+        cfg: configuration as the user wrote it.
         notify: called with a sentence if the store is that of ``MLFLOW_TRACKING_URI``.
 
     Raises:
@@ -60,7 +60,7 @@ def open_tracker(cfg: TrackingCfg, folder: RunFolder, facts: Facts) -> Tracker:
     """Return the tracker that a configuration names.
 
     Args:
-        cfg: which one, and where to.
+        cfg: kind of tracker, and its store.
         folder: the run, with its ``config.yaml`` and, when resumed, its earlier records.
         facts: values of `pgdm.runs.folder.FACTS` before there is a result; None where unknown.
 

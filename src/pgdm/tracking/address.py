@@ -21,9 +21,9 @@ def chosen(uri: str | None, key: str, notify: Callable[[str], object]) -> str | 
     """Return the store that the user names: ``uri``, else ``MLFLOW_TRACKING_URI``, else None.
 
     Args:
-        uri: as the user wrote it; None or empty if not given.
-        key: the setting or option it is from.
-        notify: called with a sentence if the environment's is taken.
+        uri: address as the user wrote it; None or empty if not given.
+        key: the setting or option that ``uri`` comes from, for messages.
+        notify: called with a sentence if the environment variable is used.
 
     Raises:
         ConfigError: as for `absolute`.
@@ -39,10 +39,10 @@ def chosen(uri: str | None, key: str, notify: Callable[[str], object]) -> str | 
 
 
 def absolute(uri: str, key: str) -> str:
-    """Return the address of a store; a relative file is taken from the working directory.
+    """Return the address of a store; a relative file is resolved against the working directory.
 
     Raises:
-        ConfigError: if MLflow cannot use it; names ``key`` and what is valid.
+        ConfigError: if MLflow cannot use the store; the message names ``key`` and valid addresses.
     """
     text = uri.strip()
     match = _SCHEME.fullmatch(text)
@@ -82,7 +82,7 @@ def _sqlite(rest: str) -> str:
 
 def _folder(rest: str) -> str:
     path = os.path.abspath(os.path.expanduser(re.sub("^//(localhost)?(?=/)", "", rest)))
-    # MLflow's own switch, for those who have to keep an old store.
+    # MLflow's own switch, for users who have to keep an old store.
     if os.environ.get("MLFLOW_ALLOW_FILE_STORE", "").lower() in ("true", "1"):
         return Path(path).as_uri()
     raise ValueError(
@@ -94,7 +94,7 @@ def _check_server(uri: str) -> None:
     parts = urlsplit(uri)
     if not parts.hostname or re.search(r"\s", uri):
         raise ValueError("it names no host")
-    _ = parts.port  # reading it checks it
+    _ = parts.port  # reading the port checks it
 
 
 def _check_database(uri: str) -> None:

@@ -12,10 +12,10 @@ from pgdm.tracking.sync import sync_run
 
 
 class Group:
-    """Such a run. Methods raise TrackingError if MLflow fails.
+    """An MLflow run with others nested below it. Methods raise TrackingError if MLflow fails.
 
     Args:
-        folder: of the group; its ``mlflow.json`` names the run.
+        folder: folder of the group; its ``mlflow.json`` names the group's run.
         uri: store of the group.
         experiment: MLflow experiment of its runs.
     """
@@ -25,7 +25,7 @@ class Group:
 
     @property
     def opened(self) -> bool:
-        """Whether its run was created in this store."""
+        """Whether the group's run was created in this store."""
         return self._link.get("uri") == self.uri
 
     def open(self, name: str, tags: Mapping[str, str]) -> None:
@@ -52,24 +52,24 @@ class Group:
         write_json(run_dir / LINK, {**read_json(run_dir / LINK), PARENT: parent})
 
     def correct(self, run_dir: Path) -> None:
-        """Give a run of a group the status of its folder, if the run was killed."""
+        """Correct the MLflow status of a nested run that was killed, from its folder."""
         folder = RunFolder(run_dir)
         status = folder.status()
         if not folder.parent() or status == "running":
             return
         with one_line_errors(f"MLflow at {self.uri}"):
             store = Store.open(self.uri, self._experiment)
-            if status == "finished":  # it could not send its last records, or any
+            if status == "finished":  # MLflow may lack its last records, or all
                 sync_run(store, folder)
                 return
-            # It may have been killed before it wrote mlflow.json.
+            # The run may have been killed before it wrote mlflow.json.
             run = find_run(store, folder)
             if run is not None and run.info.status == STATUS["running"]:
                 ended_ms = int(1000 * folder.modified())
                 store.client.set_terminated(run.info.run_id, STATUS[status], ended_ms)
 
     def close(self, status: str) -> None:
-        """Set how it ended: ``finished``, ``interrupted`` or ``failed``."""
+        """Set how the group ended: ``finished``, ``interrupted`` or ``failed``."""
         with one_line_errors(f"MLflow at {self.uri}"):
             client = Store.open(self.uri, self._experiment).client
             client.set_terminated(str(self._link.get("run_id")), STATUS[status])

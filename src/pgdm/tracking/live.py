@@ -32,10 +32,10 @@ class MlflowTracker(Tracker):
     """Mirrors a run from its own thread, so that training never waits for MLflow.
 
     Importing MLflow alone takes two seconds. A failure is reported once and retried later;
-    ``pgdm runs sync`` fills in from the folder what is still missing at the end.
+    ``pgdm runs sync`` adds from the run folder what is still missing at the end.
 
     Args:
-        cfg: where to.
+        cfg: store and MLflow experiment.
         folder: the run, with ``config.yaml`` and, when resumed, its earlier records.
         facts: values of `pgdm.runs.folder.FACTS` before there is a result; None where unknown.
     """
@@ -95,7 +95,7 @@ class MlflowTracker(Tracker):
         )
 
     def _flush(self) -> None:
-        """Send what is queued; what cannot be sent stays in the queues."""
+        """Send the queued points and videos; those that cannot be sent stay queued."""
         if time.monotonic() < self._not_before:
             return
         self._not_before = time.monotonic() + RETRY_S  # reset below if nothing fails
@@ -115,7 +115,7 @@ class MlflowTracker(Tracker):
         self._not_before = 0.0
 
     def _connected(self) -> Mirror:
-        """Return the mirror; the first call opens it and sends the earlier records it lacks."""
+        """Return the mirror; the first call opens it, and sends earlier records that it lacks."""
         if self._mirror is not None:
             return self._mirror
         store = Store.open(self._uri, self._cfg.experiment)
@@ -129,7 +129,7 @@ class MlflowTracker(Tracker):
                 mirror.posters()
         else:
             mirror.set_status("running")
-            # MLflow may have been out of reach, or the process was killed.
+            # MLflow lacks records if it was unreachable, or if an earlier process was killed.
             mirror.log(lacking(earlier, history(store, run)))
         mirror.describe({"attempts": str(self._attempts)})
         mirror.artifacts()
@@ -140,7 +140,7 @@ class MlflowTracker(Tracker):
         self._not_before = 0.0
         self._flush()
         mirror = self._connected()
-        self._folder = RunFolder(self._folder.path)  # with the result written meanwhile
+        self._folder = RunFolder(self._folder.path)  # reread: the result was written meanwhile
         mirror.refresh(self._folder)
         mirror.describe({SYNCED: self._folder.fingerprint()})
         mirror.artifacts()

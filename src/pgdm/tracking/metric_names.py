@@ -9,7 +9,7 @@ class Metric(NamedTuple):
     """One metric."""
 
     name: str
-    """Without its group."""
+    """Name without its group."""
     groups: str
     """``train``, ``eval`` or ``both``."""
     unit: str
@@ -18,18 +18,25 @@ class Metric(NamedTuple):
 
 METRICS = (
     Metric("success", "both", "0..1", "share of steps with the object within 1 cm of its target"),
-    Metric("com_error", "both", "m", "mean distance of the object's centre of mass to its target"),
+    Metric(
+        "com_error", "both", "m", "mean distance of the object's centre of mass from its target"
+    ),
     Metric(
         "com_error_released",
         "both",
         "m",
-        "the released code's error, which the paper's tables show: Frobenius norm over T-1",
+        "error as the released code computes it and the paper shows it: Frobenius norm divided by "
+        "T-1",
     ),
     Metric("ori_error", "both", "rad", "mean angle between object and target orientation"),
-    Metric("lifted", "both", "0..1", "of steps with a raised target, share with a raised object"),
+    Metric(
+        "lifted", "both", "0..1", "among steps with a raised target, the share with a raised object"
+    ),
     Metric("dropped", "both", "0..1", "share of episodes that lifted the object and lost it again"),
-    Metric("length", "both", "steps", "control steps until the episode ended (25 a second)"),
-    Metric("return", "both", "reward", "sum of the task's own rewards over an episode"),
+    Metric("length", "both", "steps", "control steps until the episode ended"),
+    Metric(
+        "return", "both", "reward", "sum of the task's rewards over an episode, without shaping"
+    ),
     Metric("shaping", "train", "reward", "sum of the rewards that shaping=... adds in training"),
     Metric("raw/<name>", "both", "-", "sum of a reward term over the episode, before weighting"),
     Metric("term/<name>", "both", "reward", "contribution of a weighted reward term to the return"),
@@ -44,7 +51,8 @@ METRICS = (
         "contact_distance_m",
         "both",
         "m",
-        "mean distance of fingertips from the expert's contact points, where it touches the object",
+        "mean distance of fingertips from the expert's contact points, while the expert touches "
+        "the object",
     ),
     Metric("diverged", "both", "0..1", "share of episodes that ended in a diverged simulation"),
     Metric("<name>_std", "eval", "as `<name>`", "standard deviation over the sampled episodes"),
@@ -56,7 +64,7 @@ METRICS = (
         "mean reward per step, shaping included (`return` excludes it)",
     ),
     Metric("weight/<name>", "train", "-", "weight of a reward term that has a schedule"),
-    Metric("steps_per_s", "train", "1/s", "environment steps per second, learning included"),
+    Metric("steps_per_s", "train", "1/s", "frames per second, learning included"),
     Metric("loss_policy", "train", "-", "policy loss: PPO's clipped objective or SAC's"),
     Metric("loss_critic", "train", "-", "SAC: squared errors of the critics, summed"),
     Metric("temperature", "train", "-", "SAC: weight of the entropy in the return"),

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 DATABASE = "mlflow.db"
 PARENT_TAG = "mlflow.parentRunId"
 SYNCED = "synced"
-"""Tag with the fingerprint of the run whose records MLflow has completely."""
+"""Tag set when MLflow has all records of a run: the fingerprint of its folder."""
 STATUS = {
     "running": "RUNNING",
     "finished": "FINISHED",
@@ -41,8 +41,8 @@ STATUS = {
     "failed": "FAILED",
 }
 _BATCH, _PARAMS = 1000, 100  # the server's limits: metrics and parameters per call
-_MACHINE_KEYS = ("run_dir", "resume")  # no parameters: the folder is a tag, as it may move
-# Without it the pages open on traces of language models.
+_MACHINE_KEYS = ("run_dir", "resume")  # not parameters: the folder may move and is a tag
+# Without this tag MLflow's pages open on its view for traces of language models.
 _EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}
 _LOCK_S = 120.0
 _SETTINGS = {
@@ -62,9 +62,10 @@ def store_uri(root: Path) -> str:
 
 
 def is_own(uri: str, folder: Path) -> bool:
-    """Return whether a store is the SQLite store of a folder, or of one that it is in.
+    """Return whether a store is the SQLite store of a folder, or of a folder above it.
 
-    Only such a store is used because a file in the folder names it: somebody else may have made it.
+    Any other store that a file in the folder names is not used: somebody else may have made the
+    file.
     """
     file, real = sqlite_file(uri), folder.resolve()
     at = None if file is None else file.parent.resolve()
@@ -89,7 +90,7 @@ class Store:
         """Open a store; the SQLite file and the experiment are created if missing.
 
         Any number of processes may do so at the same time: a lock lets one at a time create the
-        database, as two would corrupt it.
+        database, since two would corrupt it.
 
         Raises:
             TrackingError: if another process holds the lock for minutes.
@@ -105,12 +106,12 @@ class Store:
 
 
 def connect(uri: str) -> MlflowClient:
-    """Return a client of an existing store that logs no progress."""
+    """Return a client of a store, and silence MLflow's progress messages."""
     os.environ.update(environment())
     from mlflow import MlflowClient
 
-    # The first two log each step of creating a database; the third one's warnings also reach us
-    # as exceptions.
+    # The first two log each step of creating a database; what urllib3 warns of is also raised as an
+    # exception.
     for name, level in (("mlflow", "WARNING"), ("alembic", "WARNING"), ("urllib3", "ERROR")):
         logging.getLogger(name).setLevel(level)
     return MlflowClient(tracking_uri=uri)
@@ -147,7 +148,7 @@ def _only_one(file: Path | None) -> Iterator[None]:
         return
     file.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=file.parent):
-        pass  # a folder that cannot be written is refused at once
+        pass  # raises at once if the folder cannot be written
     lock = FileLock(f"{file}.lock", timeout=_LOCK_S)
     try:
         lock.acquire()
@@ -160,11 +161,11 @@ def _only_one(file: Path | None) -> Iterator[None]:
 
 
 def _check_writable(file: Path) -> None:
-    """Refuse a file that is no writable database at once: MLflow tries it for two minutes."""
+    """Raise at once if a file is not a writable database: MLflow would retry for two minutes."""
     with contextlib.closing(sqlite3.connect(f"{file.as_uri()}?mode=rw", uri=True)) as base:
         try:
             base.execute("BEGIN IMMEDIATE")
-            base.execute("PRAGMA user_version = 0")  # undone when it is closed
+            base.execute("PRAGMA user_version = 0")  # undone when the database is closed
         except sqlite3.OperationalError as error:
             if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
                 raise OSError(f"{file}: {error}") from error
@@ -173,7 +174,7 @@ def _check_writable(file: Path) -> None:
 
 
 def _create(file: Path) -> None:
-    """Create a database atomically: MLflow cannot use one that is half created."""
+    """Create a database atomically, since MLflow cannot use a half-created database."""
     for stale in file.parent.glob(f"{TEMPORARY}*{file.name}*"):  # of a process that was killed
         stale.unlink()
     with replacing(file) as temp:
@@ -181,7 +182,7 @@ def _create(file: Path) -> None:
 
 
 def _experiment(client: MlflowClient, name: str, file: Path | None) -> str:
-    """Return the id of an MLflow experiment, created or restored if need be."""
+    """Return the ID of an MLflow experiment, which is created or restored if necessary."""
     from mlflow.exceptions import MlflowException
 
     found = client.get_experiment_by_name(name)
@@ -190,7 +191,7 @@ def _experiment(client: MlflowClient, name: str, file: Path | None) -> str:
         tags = {"mlflow.note.content": metric_names.markdown(), **_EXPERIMENT_TAGS}
         try:
             return client.create_experiment(name, artifact_location=place, tags=tags)
-        except MlflowException:  # on a server another process may have been first
+        except MlflowException:  # another process may have created it on the server first
             found = client.get_experiment_by_name(name)
             if found is None:
                 raise
@@ -202,8 +203,8 @@ def _experiment(client: MlflowClient, name: str, file: Path | None) -> str:
 def find_run(store: Store, folder: RunFolder) -> Run | None:
     """Return the MLflow run that mirrors a folder, or None.
 
-    It is the one that ``mlflow.json`` names, unless the folder is a copy of another that still
-    exists; otherwise the newest one tagged with this folder and host.
+    This is the run that ``mlflow.json`` names, unless the folder is a copy of another folder that
+    still exists; otherwise the newest run tagged with this folder and host.
     """
     from mlflow.exceptions import MlflowException
 
@@ -227,8 +228,8 @@ class Mirror:
     """Writes one run into a store.
 
     Args:
-        store: where to.
-        folder: the run.
+        store: the store to write to.
+        folder: folder of the run.
         run: its MLflow run; None creates one.
     """
 
@@ -248,12 +249,12 @@ class Mirror:
         self._params = dict(run.data.params)
 
     def link(self, news: Mapping[str, Any]) -> None:
-        """Write to the folder which run mirrors it, and ``news``."""
+        """Record in ``mlflow.json`` which MLflow run mirrors the folder, and ``news``."""
         mine = {"run_id": self.run_id, "uri": self._store.uri}
         write_json(self._folder.path / LINK, {**self._folder.link, **news, **mine})
 
     def refresh(self, folder: RunFolder) -> None:
-        """Use a folder that was read again."""
+        """Use ``folder``, the same folder read again."""
         self._folder = folder
 
     def describe(self, tags: Mapping[str, str]) -> None:
@@ -304,12 +305,12 @@ class Mirror:
         """Copy one file."""
         with tempfile.TemporaryDirectory(prefix="pgdm-") as folder:
             if path.name == LOG:
-                # It may grow while it is sent, which a server would take for another request.
+                # The log may grow while it is sent: a server would take the rest for a new request.
                 path = Path(shutil.copy2(path, folder))
             self._client.log_artifact(self.run_id, str(path), place or None)
 
     def poster(self, path: Path, frames: int) -> None:
-        """Show a picture on the run's page; a slider there selects the frames."""
+        """Show a picture on the run's page in MLflow, where a slider selects ``frames``."""
         from PIL import Image
 
         with Image.open(io.BytesIO(files.read_bytes(path))) as picture:

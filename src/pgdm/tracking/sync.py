@@ -50,20 +50,20 @@ class Synced:
 def sync(
     root: Path, uri: str | None = None, notify: Callable[[Synced], None] = lambda _: None
 ) -> list[Synced]:
-    """Make MLflow show every run of a folder as recorded there.
+    """Make MLflow show every run below a folder as recorded in its run folder.
 
-    A second call changes nothing. A running run is left to its own process; a run whose records
-    MLflow contradicts is created again there, and the wrong one moved to MLflow's trash.
+    A second call changes nothing. A running run is left to its own process. If MLflow contradicts
+    a run's records, its MLflow run is moved to MLflow's trash and created again.
 
     Args:
         root: folder of runs.
         uri: store to fill; None: that of ``MLFLOW_TRACKING_URI``, or ``mlflow.db`` in ``root``.
-            What a run's own settings name is not written to: somebody else may have made the run.
-        notify: called after each run; one that cannot be synced does not stop the others.
+            A store named in a run's settings is ignored, since somebody else may have made the run.
+        notify: called after each run; a run that cannot be synced does not stop the others.
 
     Raises:
-        ConfigError: if ``uri`` or ``MLFLOW_TRACKING_URI`` is no store of MLflow's.
-        TrackingError: in the end, if runs could not be synced.
+        ConfigError: if ``uri`` or ``MLFLOW_TRACKING_URI`` is not an MLflow store.
+        TrackingError: after all runs, if some could not be synced.
     """
     stores: dict[tuple[str, str], Store | TrackingError] = {}
     done, place = [], chosen(uri, "--uri", _log.warning) or store_uri(root)
@@ -89,7 +89,7 @@ def sync(
 
 
 def _opened(stores: dict[tuple[str, str], Store | TrackingError], uri: str, name: str) -> Store:
-    """Return a store, opened once; one that is out of reach is not waited for again."""
+    """Return a store, opened only once; an unreachable store is not tried again."""
     if (uri, name) not in stores:
         try:
             with one_line_errors(f"MLflow at {uri}"):

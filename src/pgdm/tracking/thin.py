@@ -8,7 +8,7 @@ from pgdm.runs.folder import RunFolder
 from pgdm.runs.log import Record, metrics_of
 
 MAX_POINTS = 1500
-"""Most points of one metric."""
+"""Maximum number of points of a metric, evaluations not counted."""
 
 Point = tuple[int, int, dict[str, float]]
 """Frames, time in ms since the epoch, and finite metrics by name."""
@@ -18,7 +18,7 @@ class Thin:
     """Passes at most ``MAX_POINTS`` points of a run, plus every evaluation.
 
     Args:
-        total_frames: the run's length.
+        total_frames: the run's length, frames.
     """
 
     def __init__(self, total_frames: int) -> None:
@@ -33,7 +33,7 @@ class Thin:
 
 
 def points(folder: RunFolder, records: Iterable[Record]) -> list[Point]:
-    """Return the points of a run's records that MLflow shows."""
+    """Return those points of a run's records that are mirrored to MLflow."""
     thin, start = Thin(folder.total_frames()), folder.started()
     found = []
     for record in records:
