@@ -1,12 +1,12 @@
-"""How far ablated starts deviate from what the ablations ask for, over all tasks.
+"""Measure how far ablated starts deviate from the ablations' definitions, over all tasks.
 
     python benchmark/ablations.py [--csv FILE] [TASK ...]
 
-Fetches the assets it can; other tasks need a checkout. ``pregrasp=planned`` falls back to mined if
-no plan is stored. Prints a summary in Markdown, as on docs/ablations.md, and writes a CSV row for
-every start. The column ``residual_gap_m`` is the fingertips' mean distance from their positions in
-the pre-grasp (for ``none``: the planned one) after the best correction of the base that an action
-of ``action=residual`` can give.
+Fetches missing assets if possible; the other tasks need a checkout. ``pregrasp=planned`` falls back
+to mined if no plan is stored. Prints a summary in Markdown, as in docs/ablations.md, and writes a
+CSV row for every start. The column ``residual_gap_m`` is the fingertips' mean distance from their
+positions in the pre-grasp (for ``pregrasp=none``: in the planned start) after the best correction
+of the base that ``action=residual`` allows.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pgdm.pregrasp.ablation.ablate import ablate
 from pgdm.pregrasp.sources import StartState, start_state
 from pgdm.sim.scene import Scene
 
-STARTS = ("planned", "mined", "none")  # the last, the reset pose, has nothing to ablate
+STARTS = ("planned", "mined", "none")  # the last start, the reset pose, has nothing to ablate
 SCALE = compose(["action=residual"]).action.residual_scale
 RESULTS = Path(__file__).parent / "results" / "ablations.csv"
 
@@ -45,7 +45,7 @@ def measure(task: str) -> list[dict[str, Any]]:
     goals: dict[str, StartState] = {}
     for pregrasp in STARTS:
         for ablation in available("ablation") if pregrasp != "none" else ("none",):
-            # Without the task, which does not matter here: each choice is composed only once.
+            # Composed without the task, which does not matter here: once for each choice.
             cfg = compose([f"pregrasp={pregrasp}", f"ablation={ablation}"])
             stored = start_state(cfg.pregrasp, builder.motion, builder.scene)
             began = time.process_time()

@@ -1,4 +1,4 @@
-"""A headless browser, driven by clicks, drags, keys and screenshots."""
+"""Drive a headless browser by clicks, drags and keys, and take screenshots."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Tab:
     """One page, controlled over the DevTools protocol.
 
     Args:
-        address: of its websocket.
-        size: of the page, pixels.
+        address: address of the page's websocket.
+        size: width and height of the page, pixels.
     """
 
     def __init__(self, address: str, size: tuple[int, int] = SIZE) -> None:
@@ -52,7 +52,8 @@ class Tab:
             mobile=False,
         )
         self("Page.enable")
-        self("Emulation.setFocusEmulationEnabled", enabled=True)  # also in the background
+        # So that the page renders also in the background.
+        self("Emulation.setFocusEmulationEnabled", enabled=True)
 
     def __call__(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Send a command and return its result."""
@@ -136,7 +137,7 @@ class Tab:
     def drag(self, start: tuple[float, float], end: tuple[float, float], moves: int = 10) -> None:
         """Drag from one point to another, in pixels."""
         self.mouse("hovered", *start)
-        time.sleep(0.3)  # an object must be drawn once while hovered over
+        time.sleep(0.3)  # the page must render an object once while the mouse is over it
         self.mouse("mousePressed", *start)
         for i in range(1, moves + 1):
             share = i / moves
@@ -188,7 +189,7 @@ class Chromium:
     """A running browser.
 
     Args:
-        port: of its DevTools.
+        port: port of the DevTools protocol.
     """
 
     def __init__(self, port: int) -> None:

@@ -1,12 +1,12 @@
-"""Attempts to learn in fewer frames: hypothesis, command and outcome of every experiment.
+"""Try to learn in fewer frames: hypothesis, command and outcome of every experiment.
 
     python benchmark/experiments.py               train what is missing, then write the table
     python benchmark/experiments.py fast kernel   only these
-    python benchmark/experiments.py --collect     write the table of what is stored
+    python benchmark/experiments.py --collect     write the table of the stored results
 
-Each experiment changes `+experiment=fast` and runs on the suite `tune6`. It shares no task with
-`quick6`, which only confirms the changes that are kept. A run stored under settings that have
-changed since is trained again. Two runs train at a time, one thread each.
+Each experiment changes `+experiment=fast` and runs on the suite `tune6`, which shares no task with
+`quick6`, the suite on which the kept changes are confirmed. A stored run is trained again if its
+settings have changed since. Two runs train at a time, one thread each.
 """
 
 from __future__ import annotations
@@ -54,19 +54,19 @@ EXPERIMENTS = (
     Experiment("fast", "the settings that were kept", (), "yes"),
     Experiment(
         "no-shaping",
-        "without a slope far from the target objects are held beside their path",
+        "without a reward gradient far from the target, objects are held off their path",
         ("shaping=none",),
         "yes: soft end",
     ),
     Experiment(
         "kernel",
-        "the wide tracking term, 5 exp(-10 e), gives a slope everywhere",
+        "the wide tracking term, 5 exp(-10 e), gives a reward gradient everywhere",
         ("shaping.kernel_weight=5",),
         "",
     ),
     Experiment(
         "kernel-alone",
-        "that term is enough, without the soft end",
+        "the wide tracking term is enough, without the soft end",
         ("shaping.soft_end_m=null", "shaping.kernel_weight=5"),
         "",
     ),
@@ -78,7 +78,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "unplanned",
-        "a path sent as it is is followed late and with a swing",
+        "a path sent unmodified is followed late and with overshoot",
         ("action.wrist_path=clipped",),
         "yes: planned",
     ),
@@ -86,19 +86,22 @@ EXPERIMENTS = (
     Experiment("no-load", "weight pulls the base down", ("action.carry_load=false",), "yes: borne"),
     Experiment(
         "cool",
-        "a tenth of the entropy's weight at the start finds contact sooner",
+        "with a tenth of the initial temperature, contact is found sooner",
         ("algo.temperature_init=0.0005",),
         "",
     ),
-    Experiment("far-sighted", "tools need a longer view", ("algo.gamma=0.98",), ""),
+    Experiment("far-sighted", "tools need a longer horizon", ("algo.gamma=0.98",), ""),
     Experiment(
-        "half-the-updates", "two updates a step cost half", ("algo.updates_per_step=2",), ""
+        "half-the-updates",
+        "two updates per step cost half the time",
+        ("algo.updates_per_step=2",),
+        "",
     ),
 )
 
 
 def identity_of(job: Job) -> str:
-    """Return the hash of all settings that act on a run's result."""
+    """Return the hash of all settings that affect a run's result."""
     return identity_hash(compose([f"task={job.task}", *job.overrides, f"seed={job.seed}"]))
 
 
@@ -121,7 +124,7 @@ def collect(run: Path, job: Job) -> dict[str, Any] | None:
 
 
 def make_way(run: Path, job: Job) -> None:
-    """Rename a run's folder if it has other settings: no run could be resumed in it."""
+    """Rename a run's folder if its settings differ, since the job could not be resumed in it."""
     if not (run / CONFIG).exists() or RunFolder(run).busy:
         return
     if (old := identity_hash(load_config(run))) != identity_of(job):
@@ -129,7 +132,7 @@ def make_way(run: Path, job: Job) -> None:
 
 
 def last(one: dict[str, Any], name: str) -> float:
-    """Return a metric at the end of a run, 0 where it does not apply."""
+    """Return a metric at the end of a run, 0 if it does not apply."""
     return one["curves"][name][-1] or 0.0
 
 

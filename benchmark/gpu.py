@@ -1,10 +1,11 @@
-"""Speed of `sim=warp` on a GPU: control steps, training and memory. Prints a table, writes JSON.
+"""Measure `sim=warp` on a GPU: speed of control steps and training, memory. Writes JSON.
 
-    python benchmark/gpu.py --out gpu.json                       a GPU: under ten minutes
-    python benchmark/gpu.py --device cpu --out gpu.json          Warp's CPU device, small: a check
+    python benchmark/gpu.py --out gpu.json                       on a GPU, in under ten minutes
+    python benchmark/gpu.py --device cpu --out gpu.json          a small test on Warp's CPU device
 
-Control steps are measured by width and scene; training of `algo=ppo_wide` on the first scene by
-width, evaluation and kernel compilation left out. What is not measured before --limit is left out.
+Control steps are measured for each number of simulations and scene, training with `algo=ppo_wide`
+for each number of simulations on the first scene, without evaluation and kernel compilation. No
+measurement starts after --limit seconds.
 """
 
 from __future__ import annotations
@@ -43,14 +44,14 @@ def main() -> None:
     )
     parser.add_argument("--device", default="cuda", help="cuda, cuda:1, ... or cpu")
     parser.add_argument("--scenes", nargs="+", default=SCENES)
-    parser.add_argument("--limit", type=float, default=480, help="stop measuring after this, s")
+    parser.add_argument("--limit", type=float, default=480, help="start nothing after this time, s")
     parser.add_argument("--out", type=Path, default=Path("gpu.json"))
     options = parser.parse_args()
     kind = options.device.partition(":")[0]
     deadline, rows = time.monotonic() + options.limit, list[dict[str, Any]]()
     jobs = [partial(stepping, s, w, options.device) for s in options.scenes for w in WIDTHS[kind]]
     jobs[3:3] = [partial(training, options.scenes[0], w, options.device) for w in WIDTHS[kind]]
-    for job in jobs:  # the training early, in case there is no time for all scenes
+    for job in jobs:  # training comes early, in case there is no time for all scenes
         if time.monotonic() < deadline:
             rows.append(job())
             print(*(f"{key} {value}" for key, value in rows[-1].items()), sep=", ", flush=True)
@@ -61,7 +62,7 @@ def main() -> None:
 
 
 def stepping(task: str, width: int, device: str) -> dict[str, Any]:
-    """Return control steps per second of N simulations under noisy actions, MDP included."""
+    """Return control steps per second of N simulations with noisy actions, MDP included."""
     env, compile_s = made(task, width, device)
     steps = STEPS[device.partition(":")[0]]
     torch.manual_seed(0)
@@ -102,7 +103,8 @@ class Timer(Callback):
 def training(task: str, width: int, device: str) -> dict[str, Any]:
     """Return frames per second of a run, the first iteration left out."""
     env, _ = made(task, width, device)
-    sizes = [f"num_envs={width}", f"algo.minibatch_size={width}"]  # as many gradient steps for all
+    # The same number of gradient steps for every number of simulations.
+    sizes = [f"num_envs={width}", f"algo.minibatch_size={width}"]
     cfg = compose([f"task={task}", "algo=ppo_wide", *sizes]).algo
     frames = 6 * width * cfg.steps_per_env
     timer = Timer(env.device)
@@ -130,7 +132,7 @@ def training(task: str, width: int, device: str) -> dict[str, Any]:
 
 
 def made(task: str, width: int, device: str) -> tuple[BatchEnv, float]:
-    """Return an environment and the seconds that it took, kernels included."""
+    """Return an environment and the time to create it, kernel compilation included, s."""
     began = time.perf_counter()
     cfg = compose([f"task={task}", "sim=warp"])
     library = ensure(cfg.task.motion, False, print)

@@ -1,14 +1,14 @@
-"""How well inverse kinematics follows human hands: every task, every hand.
+"""Measure how well inverse kinematics follows human hands, for every task and every hand.
 
     python benchmark/ik.py [--tasks hammer-use1 cup-pour1] [--hands adroit dhand dmanus]
 
-A pose is a success if every measured fingertip is within 2 cm of its target (the human's
-fingertip; for Adroit following a whole human hand, that of the human's joints with Adroit's bone
-lengths, as in the published trajectories), the hand penetrates nothing, and all joints are within
-their limits. If the library has no human hand for a task, its own hand at the mined pre-grasp is
-followed. For Adroit also: the distance from the mined pre-grasps, and their distance from the
-published trajectory of the same hand in the same frame. Results are stored as they are computed; a
-second call resumes. Needs the assets of a TCDM checkout and the experts.
+A pose is a success if every measured fingertip is within 2 cm of its target (the human's fingertip;
+if Adroit follows a whole human hand, that of the human hand scaled to Adroit's bone lengths, as in
+the published trajectories), the hand penetrates nothing, and all joints are within their limits. If
+the library has no human hand for a task, the task's own hand at the mined pre-grasp is followed.
+For Adroit, the distance from the mined pre-grasps is measured too, and the distance of these from
+the published trajectory of the same hand in the same frame. Results are stored as they are
+computed; a second call resumes. Needs the assets of a TCDM checkout and the experts.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def measure(task: str, hand: str) -> dict[str, Any]:
 
 
 def published(scene: Scene, task: str, qpos: np.ndarray) -> dict[str, float]:
-    """Return the distances of an Adroit's pose and of the expert's from the mined pre-grasp."""
+    """Return how far Adroit's pose and the expert's are from the mined pre-grasp."""
     library, ik = open_library(), HandIk(scene)
     mined = library.motion(task).starts["mined"].qpos
     expert = np.concatenate((library.expert(task).qpos[0], mined[30:]))

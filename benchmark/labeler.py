@@ -1,7 +1,7 @@
-"""Interactions per second that the labeler handles, with a real page open in a browser.
+"""Measure how many interactions per second the labeler handles, with a page open in a browser.
 
-python benchmark/labeler.py                       writes benchmark/results/labeler.json
-python benchmark/labeler.py --picture FILE.jpg    writes the documentation's picture instead
+python benchmark/labeler.py writes benchmark/results/labeler.json python benchmark/labeler.py
+--picture FILE.jpg writes the documentation's picture instead
 
 An interaction is one change of a slider or handle: joints, forward kinematics, contacts and
 distances are computed, and the scene is sent to the page. The labeler runs on one core; the browser
@@ -56,7 +56,7 @@ def look_at(chrome: Chromium, page: LabelPage) -> Tab:
     while time.monotonic() < end:
         with Image.open(io.BytesIO(tab.picture())) as picture:
             seen = np.asarray(picture.convert("RGB"))[200:600, 200:800].reshape(-1, 3)
-        if len(np.unique(seen // 8, axis=0)) > 100:  # an empty page has only a few
+        if len(np.unique(seen // 8, axis=0)) > 100:  # an empty page has only a few colours
             return tab
     raise TimeoutError("the page was not rendered")
 
@@ -82,7 +82,7 @@ def measure(page: LabelPage, move: Callable[[float], None]) -> tuple[float, floa
     began, used = time.perf_counter(), time.process_time()
     for i in range(INTERACTIONS):
         move(float(np.sin(0.3 * i)))
-        page.mailbox.wait()  # so that none is dropped
+        page.mailbox.wait()  # so that no change is skipped
     page.server.flush()
     wall_s, cpu_s = time.perf_counter() - began, time.process_time() - used
     return INTERACTIONS / wall_s, INTERACTIONS / cpu_s
@@ -101,7 +101,7 @@ def run(chrome: Chromium, console: Console) -> dict[str, Any]:
                 wall, cpu = measure(page, move)
             rates[task][name] = {"per_s": round(wall, 1), "per_s_of_one_core": round(cpu, 1)}
             console.print(f"{task} {name}: {wall:.0f}/s, {cpu:.0f} per core-second")
-        tab.wait("document.body.innerText.includes('fingertips')")  # it is still there
+        tab.wait("document.body.innerText.includes('fingertips')")  # the page still responds
         tab.close()
         page.close()
         draft.close()
@@ -109,7 +109,7 @@ def run(chrome: Chromium, console: Console) -> dict[str, Any]:
 
 
 def take_picture(chrome: Chromium, path: Path) -> None:
-    """Write the documentation's picture: the hand slightly too low."""
+    """Write the picture for the documentation, with the hand slightly too low."""
     page, draft = opened("hammer-use1", "planned")
     pos, quat = page.state.kinematics.wrist_pose(page.state.qpos)
     for phase in ("start", "update", "end"):
@@ -117,7 +117,7 @@ def take_picture(chrome: Chromium, path: Path) -> None:
     page.mailbox.wait()
     tab = look_at(chrome, page)
     tab.script("document.querySelector('#webgl-software-rendering button')?.click()")
-    time.sleep(10.0)  # until the warning is gone, and everything is rendered
+    time.sleep(10.0)  # until the warning has disappeared and everything is rendered
     with Image.open(io.BytesIO(tab.picture())) as picture:
         picture.convert("RGB").save(path, quality=QUALITY, optimize=True)
     page.close()

@@ -1,14 +1,14 @@
-"""What pgdm learns in a million frames on six varied tasks; stores results and curves.
+"""Measure what pgdm learns in a million frames on six varied tasks; store results and curves.
 
     python benchmark/learning.py                    train what is missing, then collect
     python benchmark/learning.py --frames 300000    train for fewer frames; a later call resumes
-                                                    (a run started for more is trained to its end)
+                                                    (a run started as longer is trained to its end)
     python benchmark/learning.py --settings fast --seeds 0
     python benchmark/learning.py --collect          collect only, also from running runs
 
-Five settings, each the same for all tasks: `+experiment=fast`, the same with a wrist that follows a
-clipped or a feasible path instead of a plan, `algo=ppo_fast action=residual`, and the paper's PPO
-on its actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two runs train at a
+There are five settings, each the same for all tasks: `+experiment=fast`, the same with a clipped or
+a feasible wrist path instead of a plan, `algo=ppo_fast action=residual`, and the paper's PPO with
+its actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two runs train at a
 time, one thread each.
 """
 
@@ -32,7 +32,7 @@ from pgdm.runs.log import RunLog, metrics_of
 RESULTS = Path(__file__).parent / "results" / "learning"
 FRAMES = 1_000_000
 EARLY = 300_000
-"""The table also shows success after so many frames."""
+"""The table also shows success after this many frames."""
 
 QUICK6 = suite("quick6")
 FAST = ("+experiment=fast", "eval.interval_frames=50000")
@@ -50,7 +50,7 @@ KINDS = ("eval_sampled", "eval_deterministic")
 
 
 def collect(run: Path, job: Job) -> dict[str, Any] | None:
-    """Return how far a run has come and its metrics there, or None if it has not started."""
+    """Return the progress of a run and its latest metrics, or None if it has not started."""
     curve = curves(run, "eval", [f"{kind}/{name}" for kind in KINDS for name in CURVES])
     frames = curve.pop("frames")
     if not frames:
@@ -90,7 +90,7 @@ def store(job: Job, one: dict[str, Any]) -> None:
 
 
 def to_train(runs: Path, job: Job, frames: int) -> Job | None:
-    """Return a job with its length, or None if a result of so many frames is stored."""
+    """Return a job with its length, or None if a result with that many frames is stored."""
     if stored(job).get("frames", 0) >= frames:
         return None
     run = runs / job.name
@@ -119,7 +119,7 @@ def with_old_scenes(found: list[dict[str, Any]], scenes: dict[str, str]) -> list
 
 
 def at(one: dict[str, Any], name: str, frames: int) -> float | None:
-    """Return a metric of a run at its first evaluation after so many frames, or None."""
+    """Return a metric at a run's first evaluation after ``frames`` frames, or None."""
     for when, value in zip(one["curve_frames"], one["curves"][name], strict=True):
         if when >= frames:
             return value
@@ -226,10 +226,10 @@ def main() -> None:
     """Train, collect, draw."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=Path, default=Path("runs/learning"))
-    parser.add_argument("--frames", type=int, default=FRAMES, help="how far to go")
+    parser.add_argument("--frames", type=int, default=FRAMES, help="frames to train for")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
     parser.add_argument("--tasks", nargs="+", choices=QUICK6, default=QUICK6)
-    parser.add_argument("--seeds", nargs="+", type=int, help="of those each setting has")
+    parser.add_argument("--seeds", nargs="+", type=int, help="only these seeds of each setting")
     parser.add_argument("--collect", action="store_true", help="do not train")
     options = parser.parse_args()
     every = [

@@ -1,4 +1,4 @@
-"""What a loss and its gradient cost on one thread; rows of ``throughput.py``."""
+"""Measure the time of a loss and its gradient on one thread, for rows of ``throughput.py``."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ REPEATS = 64
 
 
 def gradient_step_ms(cfg: ExperimentCfg) -> tuple[float, float, float]:
-    """Return ms of one minibatch's loss and gradient, on one thread.
+    """Return the time of one minibatch's PPO loss and gradient on one thread, ms.
 
-    By pgdm's loss in two halves, as its learner computes it; by its ``forward``; and by the
+    Of pgdm's loss in two halves, as its learner computes it; of its ``forward``; and of the
     ``forward`` of TorchRL's ``ClipPPOLoss``.
     """
     algo = cfg.algo
@@ -70,7 +70,7 @@ def gradient_step_ms(cfg: ExperimentCfg) -> tuple[float, float, float]:
 
 
 def critic_gradient_ms(cfg: ExperimentCfg) -> tuple[float, float]:
-    """Return ms of one batch's critic loss and gradient, critics one by one and under vmap."""
+    """Return the time of one batch's critic loss and gradient, one by one and under vmap, ms."""
     algo, generator = cfg.algo, torch.Generator().manual_seed(0)
     assert isinstance(algo, SACCfg)
     m, obs_dim, action_dim = algo.batch_size, 322, 30
@@ -91,7 +91,7 @@ def critic_gradient_ms(cfg: ExperimentCfg) -> tuple[float, float]:
             target_entropy=-30.0,
             generator=generator,
         )
-        SoftUpdate(loss, tau=0.01)  # without one the loss warns
+        SoftUpdate(loss, tau=0.01)  # without a value estimator the loss warns
         loss.deactivate_vmap = not vmap
         loss._make_vmap()
         params, times = list(loss.qvalue_network_params.parameters()), []

@@ -1,4 +1,4 @@
-"""What a method's terms cost the batch env; rows of ``throughput.py``."""
+"""Measure the time of a method's terms in the batch env, for rows of ``throughput.py``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pgdm.experiment import env_builder
 from pgdm.library import open_library
 from pgdm.methods import METHODS
 
-STEPS = 200  # control steps of all simulations in one measurement: the differences are small
+STEPS = 200  # control steps of all simulations in one measurement, as the differences are small
 IMITATING = ("deepmimic", "full")
 
 
@@ -27,7 +27,7 @@ def step_methods_in_turn(builders: dict[str, EnvBuilder], num_envs: int) -> dict
         noise = torch.randn((num_envs, first.action_dim), generator=generator)
         action = first.warm_start() + 0.2 * noise
         names = list(envs)
-        # The order rotates: each env runs with caches that the one before has filled.
+        # The order rotates, since each env runs with caches that the previous env has filled.
         for name in names[step % len(names) :] + names[: step % len(names)]:
             start = time.perf_counter()
             envs[name].step(action)
@@ -41,7 +41,7 @@ def measure_methods(
     """Return each method's speed in every round, in steps/s and relative to PGDM's."""
     torch.set_num_threads(1)
     library = open_library()
-    # Without terminations of their own all methods step the same states.
+    # Without the methods' own terminations, all of them step the same states.
     same = ["method.imitation.max_hand_error=null"]
     builders = {
         name: env_builder(

@@ -1,11 +1,11 @@
-"""Whether the methods' reward terms have an effect: short runs on three tasks; stores curves.
+"""Check whether the methods' reward terms have an effect, in short runs on three tasks.
 
     python benchmark/methods.py                  train what is missing, then collect
     python benchmark/methods.py --collect        collect only
     python benchmark/methods.py --frames 8192 --tasks cup-pour1 --out /tmp/try     a short trial
 
 Questions: does the hand come closer to the expert's with DeepMimic than without; do fingertips come
-closer to the contact points with GRAFF*; does the curriculum's weight follow its line; does a hand
+closer to the contact points with GRAFF*; does the curriculum's weight follow its ramp; does a hand
 that starts at its reset pose touch the object at all. PGDM is trained with the expert's terms at
 weight 0, so that the same metrics are measured. Each run is an ordinary `pgdm-run`: the same
 command resumes it. Values are means over the 25 episodes of an evaluation, actions sampled.
@@ -34,7 +34,7 @@ from pgdm.sim.contact import FingertipDistance
 RESULTS = Path(__file__).parent / "results" / "methods"
 TASKS = ("hammer-use1", "cup-pour1", "spheremedium-lift")
 FRAMES = 200_000
-# The curriculum's weight reaches its value in the middle of the run.
+# The curriculum's weight reaches its final value in the middle of the run.
 RAMP_SHARE = 0.5
 TRACKING_WEIGHT = 10.0
 EVALUATIONS = 5
@@ -120,7 +120,7 @@ def _without_empty(curve: dict[str, list[float | None]]) -> dict[str, list[float
 
 
 def off_the_line(run: dict[str, Any]) -> float:
-    """Return the largest distance of a curriculum's recorded weight from its line."""
+    """Return the largest deviation of a curriculum's recorded weight from its ramp."""
     curve, frames = run["train"], run["train"]["frames"]
     ramp = next(int(o.split("=")[1]) for o in run["overrides"] if "ramp_frames" in o)
     starts = [0, *frames[:-1]]  # an iteration's weight is that of its first frame

@@ -1,10 +1,11 @@
-"""How well pre-grasps are predicted for unseen objects.
+"""Measure how well pre-grasps are predicted for unseen objects.
 
     python benchmark/predictor.py [--out FOLDER] [--once] [--no-lift] [TASK ...]
 
-For each object a predictor is fitted on the pre-grasps of all others, and compared on the object's
-tasks with the mined pre-grasp. Writes one JSON file per task, so that it can resume,
-then the tables of docs/pregrasps/learned.md and a picture. Needs a TCDM checkout in the library.
+For each object, a predictor is fitted to the pre-grasps of all other objects; its predictions for
+the object's tasks are compared with the mined pre-grasps. Writes one JSON file per task, so that a
+later call resumes, then the tables of docs/pregrasps/learned.md and a picture. Needs a TCDM
+checkout in the library.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ RESULTS = Path(__file__).parent / "results" / "predictor"
 HAND = "adroit"
 BEST_OF = (1, 8, 32)
 CANDIDATES = 4
-CHOOSING, JUDGING = 12, 16  # policies of the lift test
-CHOOSING_SEED, JUDGING_SEED = 0, 1  # judged by other policies than it was chosen by
+CHOOSING, JUDGING = 12, 16  # numbers of policies in the lift test
+CHOOSING_SEED, JUDGING_SEED = 0, 1  # other policies judge a candidate than those that chose it
 SHOWN = ("hammer-use1", "mug-drink3", "stamp-stamp1", "alarmclock-lift")
 
 Case = tuple[Scene, Motion, Example]
 
 
 def cases() -> list[Case]:
-    """Return the tasks of the hand whose object lies free."""
+    """Return the hand's tasks whose object is not attached to anything."""
     library, found = open_library(), []
     for task in available("task"):
         cfg = compose([f"task={task}"])
@@ -63,7 +64,7 @@ def nearest(train: Sequence[Example], wanted: Example) -> np.ndarray:
 def best_of(
     frame: GraspFrame, predictor: Predictor, one: Example, count: int, rounds: int = 8
 ) -> float:
-    """Return the expected fingertip error of the best of some samples, m."""
+    """Return the expected fingertip error of the best of ``count`` samples, m."""
     found = []
     for seed in range(rounds):
         samples = predictor.sample(one.code, count, seed)
@@ -214,14 +215,15 @@ def main() -> None:
     parser.add_argument("tasks", nargs="*", metavar="TASK", help="only these")
     parser.add_argument("--out", type=Path, default=RESULTS, help=f"[{RESULTS}]")
     parser.add_argument("--no-lift", action="store_true", help="only fingertip errors; not stored")
-    parser.add_argument("--once", action="store_true", help="only one task of each object")
+    parser.add_argument("--once", action="store_true", help="only one task per object")
     arguments = parser.parse_args()
     found = cases()
     every = [one for _, _, one in found]
     rows: dict[str, dict[str, Any]] = {}
     arguments.out.mkdir(parents=True, exist_ok=True)
     turns = [sum(other.object == one.object for other in every[:i]) for i, one in enumerate(every)]
-    for turn, i in sorted((turn, i) for i, turn in enumerate(turns)):  # objects' first tasks
+    # First one task of every object.
+    for turn, i in sorted((turn, i) for i, turn in enumerate(turns)):
         case, task = found[i], every[i].task
         if (arguments.tasks and task not in arguments.tasks) or (arguments.once and turn > 0):
             continue

@@ -1,8 +1,8 @@
-"""Whether networks trained by gradient descent predict pre-grasps better than the linear fit.
+"""Check whether networks trained by gradient descent predict pre-grasps better than the linear fit.
 
     python benchmark/predictor_networks.py
 
-An ensemble of 8 small networks with Gaussian heads (64 hidden units, tanh; mean and standard
+Trains an ensemble of 8 small networks with Gaussian heads (64 hidden units, tanh; mean and standard
 deviation of the first 10 principal components of the grasp vectors; noise on the codes and weight
 decay against over-fitting), with the examples and the metric of ``predictor.py``: each object left
 out in turn. Writes one JSON file.
@@ -36,7 +36,7 @@ class Ensemble:
         codes: (n, B).
         vectors: (n, D).
         decay: weight decay.
-        seed: of weights, batches and noise.
+        seed: seed of weights, batches and noise.
     """
 
     def __init__(self, codes: np.ndarray, vectors: np.ndarray, decay: float, seed: int = 0) -> None:

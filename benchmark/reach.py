@@ -1,14 +1,14 @@
-"""Our reach plans compared with the released ones, and the quality of every pre-grasp.
+"""Compare pgdm's reach plans with the released ones, and measure the quality of every pre-grasp.
 
     python benchmark/reach.py [--seed 0 1 2] [TASK ...]
     python benchmark/reach.py --write
 
-The first plans the reach to the mined pre-grasp of each task, plays the plan stored with the task
-for comparison, and measures every pre-grasp of the task. Results are stored in results/reach/, one
-file per task; a stored result is not computed again. The second writes the summary, the picture and
-the tables of docs/pregrasps/ from them. Needs a library with the tasks' assets and experts;
-released plans come with a TCDM checkout only. Predicted hands are those of benchmark/predictor.py,
-and demonstrations those that PGDM_DAPG_DEMOS names.
+The first command plans the reach to the mined pre-grasp of each task, plays the plan stored with
+the task for comparison, and measures every pre-grasp of the task. Results are stored in
+results/reach/, one file per task; a stored result is not computed again. The second command writes
+the summary, the picture and the tables of docs/pregrasps/ from these results. Needs a library with
+the tasks' assets and experts; released plans come with a TCDM checkout only. Predicted hands are
+those of benchmark/predictor.py, and demonstrations those that PGDM_DAPG_DEMOS names.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def update(task: str, seed: int) -> None:
 
 
 def all_starts(scene: Scene, library: Library, motion: Motion) -> dict[str, np.ndarray]:
-    """Return the task's starts of every source, and the mined one with ablated fingers."""
+    """Return the task's starts of every source, and the mined start with ablated fingers."""
     starts = {name: start.qpos for name, start in motion.starts.items()}
     if motion.id in library.experts().experts:
         human = of_expert(library.expert(motion.id), motion)

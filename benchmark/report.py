@@ -1,9 +1,9 @@
-"""Time and memory of `pgdm report` on runs as many and as long as the paper's.
+"""Measure time and memory of `pgdm report` on as many and as long runs as the paper's.
 
     python benchmark/report.py [--keep FOLDER]
 
-Fabricates 150 finished runs, 50 tasks with three seeds, with the files of a training of 50M frames
-(2 GB), then runs the command twice in a process of its own and stores the measurements in results/.
+Fabricates 150 finished runs, 50 tasks with three seeds, with the files of a run of 50M frames
+(2 GB), then runs the command twice in a separate process and stores the measurements in results/.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RESULT = Path(__file__).parent / "results" / "report.json"
 SEEDS = 3
 STEP = 4096  # frames per iteration
 EVAL_EVERY = 244  # iterations, about 1M frames
-# Makes a line as long as that of a training.
+# Makes a line as long as in a real run's log.
 OTHERS = ", ".join(f'"train/metric_{i}": 0.{i:02d}23456789012345' for i in range(28))
 
 

@@ -1,11 +1,11 @@
-"""How well expert hand trajectories are rebuilt: each published one is left out in turn.
+"""Measure how well expert hand trajectories are rebuilt, leaving out each published one in turn.
 
     python benchmark/retarget.py [--tasks hammer-use1 cup-pour1]
 
 Rebuilds every published trajectory of the benchmark from MyoHand's recording, by a regression
-fitted without it, and compares the two. Also the last step alone: the limp hand that follows the
-published human joints. Downloads both packages (190 MB, once). Without --tasks the results are
-stored in results/retarget.json.
+fitted without it, and compares the two. Also measures the last step alone, the limp hand that
+follows the published human joints. Downloads both packages (190 MB, once). Without --tasks the
+results are stored in results/retarget.json.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Measure:
         return found
 
     def fingertips_mm(self, joints: np.ndarray, others: np.ndarray) -> float:
-        """Return the mean distance of fingertips, joints clipped to their ranges."""
+        """Return the mean fingertip distance with joints clipped to their ranges, mm."""
         tips = [self.hand.fingertips(self.hand.clipped(q)) for q in (joints, others)]
         return 1e3 * float(np.linalg.norm(tips[0] - tips[1], axis=-1).mean())
 
@@ -123,7 +123,7 @@ def rounded(rows: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
 def main() -> None:
     """Measure and print; store the results unless --tasks was given."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--tasks", nargs="+", help="only these; stores nothing")
+    parser.add_argument("--tasks", nargs="+", help="measure only these and store nothing")
     chosen = parser.parse_args().tasks
     known = [task for task in MOCAP_TASKS if task not in REBUILT_EXPERTS]
     if unknown := set(chosen or ()) - set(known):

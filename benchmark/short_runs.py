@@ -1,4 +1,4 @@
-"""Short runs behind a stored result, ordinary ones, so that those that stopped can be resumed."""
+"""Train, store and report the short runs of the benchmarks; each is an ordinary `pgdm-run`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Name of its folder and of its stored result."""
+        """Name of the run's folder and of its stored result."""
         name = f"{self.task}-{self.setting}"
         return name if self.seed is None else f"{name}-s{self.seed}"
 
@@ -57,7 +57,7 @@ def train_all(folder: Path, jobs: Sequence[Job]) -> None:
     """Train jobs, a few at a time, one thread each.
 
     Raises:
-        SystemExit: if one failed, after all have run.
+        SystemExit: if a job failed, after all have run.
     """
     with ThreadPoolExecutor(AT_A_TIME) as pool:
         codes = list(pool.map(lambda job: train(folder, job), jobs))
@@ -78,9 +78,9 @@ def curves(run: Path, kind: str, names: Sequence[str]) -> dict[str, list[float |
     """Return metrics of a run at each record of a kind, rounded, with ``frames`` and ``minutes``.
 
     Args:
-        run: its folder.
+        run: folder of the run.
         kind: ``train`` or ``eval``.
-        names: metrics; None, unlike NaN valid JSON, stands for one that was not recorded.
+        names: metrics. A value that was not recorded is None, since NaN is not valid JSON.
     """
     lines = [line for line in RunLog(run / LOG).read() if line["kind"] == kind]
     found: dict[str, list[float | None]] = {
@@ -94,9 +94,9 @@ def curves(run: Path, kind: str, names: Sequence[str]) -> dict[str, list[float |
 
 
 def store(found: RunFolder, target: Path, results: Path) -> None:
-    """Copy what a report needs of a run, its training curve thinned, to a folder of results."""
+    """Copy the files of a run that a report needs, with a thinned training curve, to ``target``."""
     target.mkdir(parents=True, exist_ok=True)
-    where = f"run_dir: {target.relative_to(results)}"  # instead of a path of this machine
+    where = f"run_dir: {target.relative_to(results)}"  # replaces a path on this machine
     config = (found.path / CONFIG).read_text(encoding="utf-8")
     config = re.sub(r"^run_dir: .*$", where, config, flags=re.MULTILINE)
     (target / CONFIG).write_text(config, encoding="utf-8")

@@ -1,14 +1,14 @@
-"""The paper's comparisons at a hundredth of its length, on the suite quick6; stores runs and page.
+"""Run the paper's comparisons at a hundredth of its length, on the suite quick6.
 
     python benchmark/study.py                             train what is missing (hours), then report
     python benchmark/study.py --settings graff-residual   only some of the settings
     python benchmark/study.py --collect                   report only
 
-Methods, ablations and the start without a pre-grasp, one seed, 0.5M frames, `algo=ppo_fast
-action=residual`; PGDM, the open hand, 15 cm and no pre-grasp also with the paper's actions. Each
-setting is a sweep (`pgdm-run -m`): the same command resumes it. Runs are stored without checkpoints
-and videos, their training curves thinned, and `pgdm report` draws page and tables from that. A
-stored run is not trained again, on whichever machine this is started.
+Trains the methods, the ablations and the start without a pre-grasp with one seed, 0.5M frames and
+`algo=ppo_fast action=residual`; PGDM, the open hand, 15 cm and no pre-grasp also with the paper's
+actions. Each setting is a sweep (`pgdm-run -m`): the same command resumes it. Runs are stored
+without checkpoints and videos, their training curves thinned, and `pgdm report` makes page and
+tables from them. A stored run is not trained again, not even on another machine.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pgdm.runs.folder import find_runs
 RESULTS = Path(__file__).parent / "results" / "study"
 PICTURE = Path(__file__).parent.parent / "docs" / "images" / "study.png"
 FRAMES = 500_000
-# The curriculum's 4M frames of the paper's 50M, as the same share of these.
+# As large a share of these frames as the paper's ramp of 4M is of its 50M.
 RAMP = f"method.curriculum.ramp_frames={4_000_000 * FRAMES // 50_000_000}"
 
 TASKS = suite("quick6")
@@ -55,7 +55,7 @@ _CHANGES = {
     "graff": (EXPERTS, ("method=graff",)),
     "curriculum": (TASKS, ("method=curriculum", RAMP)),
 }
-# With the paper's actions as well: residual ones cannot move the hand back to its pre-grasp.
+# Also with the paper's actions, since residual ones cannot move the hand back to its pre-grasp.
 _ALSO_ABSOLUTE = ("pgdm", "no_pregrasp", "open_hand", "distance_15cm")
 SETTINGS = {
     f"{name}-{action}": (_CHANGES[name][0], (f"action={action}", *_CHANGES[name][1]))
@@ -88,7 +88,7 @@ def run(setting: str, folder: Path) -> int:
 
 
 def measured() -> Rows:
-    """Return success and lifted (None of a door) by setting and task, or why there are none."""
+    """Return success and lifted (None for a door) by setting and task, or why there are none."""
     found: Rows = {}
     for setting, (tasks, _) in SETTINGS.items():
         cells = found.setdefault(setting, [])

@@ -1,10 +1,10 @@
-"""What a sweep costs: planning it, its ledger, MLflow, and `pgdm sweep status` on 150 jobs.
+"""Measure the overhead of a sweep: planning, ledger, MLflow, and `pgdm sweep status` on 150 jobs.
 
     python benchmark/sweep.py [--task hammer-use1] [--write]
 
 The plan is that of the study validate_tcdm50, timed as a whole process. The sweep whose status is
 queried is synthetic, with two attempts at each job and full-size records. Values are medians of
-five. Shares are of processor time: the driver's of one core, MLflow's of a training of a few
+five. Shares are shares of processor time: the driver's of one core, MLflow's of a run of a few
 iterations on one thread, where the thread that talks to MLflow is timed separately.
 """
 
@@ -44,7 +44,7 @@ RESULT = Path(__file__).parent / "results" / "sweep.json"
 JOBS, ROUNDS = 150, 5
 ITERATIONS = 6
 FRAMES = 1_000_000  # of the run over which MLflow's one-time cost is spread
-LINES = 300  # records at the end of a running job's log, more than are ever read
+LINES = 300  # records at the end of a running job's log; more than are ever read
 METRICS = {f"eval_{kind}/metric_{i}": 0.123456789 for kind in ("sampled", "it") for i in range(30)}
 
 
@@ -77,7 +77,7 @@ def synthetic(folder: Path, running: int) -> None:
 def median_s(
     work: Callable[[], object], times: int = 1, clock: Callable[[], float] = time.perf_counter
 ) -> float:
-    """Return the time of one piece of work, s."""
+    """Return the median time of one call, s."""
     found = []
     for _ in range(ROUNDS):
         start = clock()
@@ -101,7 +101,7 @@ def ledger_costs(folder: Path) -> dict[str, float]:
     show_s = median_s(lambda: rows(ledger), 5, time.process_time)
     return {
         "attempt_ms": 1000 * median_s(attempt, 5),
-        # The driver reads the states five times a second, and shows them every other second.
+        # The driver reads the states five times a second and shows them every two seconds.
         "driver_share_of_a_core": 5 * look_s + show_s / 2,
     }
 
@@ -117,7 +117,7 @@ def status_s(folder: Path) -> float:
 
 
 def planning_s() -> float:
-    """Measure a dry run of the 150 jobs of a study, the start of Python and Hydra included."""
+    """Measure a dry run of a study's 150 jobs, including the start-up of Python and Hydra."""
     program = Path(sys.executable).with_name("pgdm-run")
 
     def plan() -> None:
@@ -130,7 +130,7 @@ def planning_s() -> float:
 
 @contextlib.contextmanager
 def timed_mlflow(spent: dict[str, float]) -> Iterator[None]:
-    """Add up the processor time of each method that talks to MLflow, s."""
+    """Add up the processor time of the methods that talk to MLflow, s."""
     originals = {name: getattr(MlflowTracker, name) for name in ("_flush", "_connected", "_end")}
 
     def timed(name: str) -> Callable[..., Any]:

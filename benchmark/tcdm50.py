@@ -1,10 +1,10 @@
-"""All 50 tasks of the benchmark with the recommended settings; stores runs and page.
+"""Store and report runs of all 50 tasks of the benchmark with the recommended settings.
 
     pgdm-run -m +experiment=fast task=tcdm50 seed=0 sweep.name=tcdm50      train (10 to 20 hours)
     python benchmark/tcdm50.py runs/sweeps/tcdm50      store the runs finished by now, and report
 
-Results can be stored while the sweep is running. Finished runs of `+experiment=fast` are taken from
-any folders given, whatever else these contain.
+Results can be stored while the sweep is running. The folders may contain other runs: only finished
+runs of `+experiment=fast` are stored.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def place(task: str, seed: int) -> Path:
 
 
 def wanted(found: RunFolder) -> bool:
-    """Return whether a run has finished with these settings and more frames than the stored one."""
+    """Return whether a run has finished with these settings and more frames than the stored run."""
     task = found.config.get("task", {}).get("id")
     if found.status() != "finished" or task not in TASKS:
         return False

@@ -1,15 +1,15 @@
-"""Speed of pgdm: stepping, training, start-up and memory. Prints one table, medians of five rounds.
+"""Measure stepping, training, start-up and memory of pgdm; print medians of five rounds.
 
     python benchmark/throughput.py [--task hammer-use1] [--rounds 5] [--write] [--methods-only]
     python benchmark/throughput.py --against OTHER_CHECKOUT [--task hammer-use1] [--rounds 5]
 
-The baseline is bare ``mujoco.batch.Batch`` doing the very same steps (targets, gravity
-compensation, restarts, from the same states) with nothing around it: in turn with each step of the
-batch env, and repeating each iteration's steps right after it in a training, so that drift of the
-machine's speed affects both alike.
+The baseline is bare ``mujoco.batch.Batch`` doing exactly the same steps (targets, gravity
+compensation, restarts, from the same states) and nothing else. It alternates with the batch env
+step by step; in training, it repeats the steps of each iteration right after the iteration. So
+drift of the machine's speed affects both alike.
 
 With ``--against``, this checkout and another one, such as the code before a change, are measured in
-turn, each round in a new process. Both are measured by this file, so only by what they share.
+turn, each round in a new process. This file measures both, so it only uses what they share.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ sys.path.append(str(HERE / "tests"))
 from toy_envs import FreeEnv  # noqa: E402
 
 RESULT = Path(__file__).parent / "results" / "throughput.json"
-NUM_ENVS = 64  # simulations of the batch env; a training has as many as its settings say
+NUM_ENVS = 64  # simulations of the batch env; in training their number follows from the settings
 STEPS = 64  # control steps of all simulations in one measurement
 CURRENT = mujoco.mjtStage.mjSTAGE_VEL
-ITERATIONS = 3  # of training in one measurement
+ITERATIONS = 3  # iterations of training in one measurement
 
 FIRST_STEP = """
 import time; start = time.perf_counter()
@@ -70,7 +70,7 @@ print(time.perf_counter() - start)
 
 @dataclass
 class Script:
-    """What the simulations of an env did: their states at the start, then step by step."""
+    """What the simulations of an env did: states at the start, targets and restarts by step."""
 
     states: np.ndarray
     targets: list[np.ndarray] = field(default_factory=list)
@@ -83,7 +83,7 @@ class Recorder:
     def __init__(self, env: BatchEnv) -> None:
         self._sim, self._step, self._reset = env.sim, env.sim.step, env.sim.reset
         self.script = Script(np.array(env.sim.rows))
-        # The env's own calls pass through here: two list entries a step, a few microseconds.
+        # Intercept the env's calls; the two list entries per step take a few microseconds.
         env.sim.step, env.sim.reset = self._on_step, self._on_reset
 
     def start(self) -> None:
@@ -96,7 +96,7 @@ class Recorder:
         return self._step(ctrl)
 
     def _on_reset(self, ids: Array, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        if self.script.restarted:  # the reset before the first step is in the states
+        if self.script.restarted:  # the states already include the reset before the first step
             self.script.restarted[-1] = np.array(ids)
         self._reset(ids, qpos, qvel)
 
@@ -131,7 +131,7 @@ class Bare:
 
 
 def play(script: Script, builder: EnvBuilder) -> tuple[float, np.ndarray]:
-    """Repeat a script with the bare physics; return s, and the final states (N, nstate)."""
+    """Repeat a script with the bare physics; return its time, s, and final states (N, nstate)."""
     bare = Bare(builder, script.states)
     start = time.perf_counter()
     for target, restarted in zip(script.targets, script.restarted, strict=True):
@@ -140,7 +140,7 @@ def play(script: Script, builder: EnvBuilder) -> tuple[float, np.ndarray]:
 
 
 def step_side_by_side(builder: EnvBuilder, num_envs: int) -> tuple[float, float]:
-    """Step env and bare physics in turn, one control step each; return s of both."""
+    """Step env and bare physics in turn, one control step each; return the time of each, s."""
     generator = torch.Generator().manual_seed(0)
     env = builder.make(num_envs)
     recorder, bare = Recorder(env), Bare(builder, np.array(env.sim.rows))
@@ -189,8 +189,8 @@ class Clock(Callback):
 def train(builder: EnvBuilder, cfg: ExperimentCfg, overlap: bool = True) -> tuple[float, float]:
     """Return steps/s of collecting and learning, and of the bare physics doing the same steps.
 
-    Evaluation and saving are left out; the first iteration is a warm-up. Without ``overlap`` soft
-    actor-critic learns while no simulation steps; each then has the machine to itself.
+    Evaluation and saving are left out; the first iteration is a warm-up. Without ``overlap``,
+    physics and the updates of soft actor-critic alternate, so that each has all cores.
     """
     threads = len(os.sched_getaffinity(0))
     frames = cfg.num_envs * cfg.algo.steps_per_env
@@ -216,16 +216,16 @@ class Ticks(Callback):
 
 
 def without_physics_ms(cfg: ExperimentCfg) -> float:
-    """Return ms of an iteration whose simulations cost nothing: acting and learning alone."""
+    """Return the time of an iteration without physics, only acting and learning, ms."""
     threads, ticks = len(os.sched_getaffinity(0)), Ticks()
-    frames = cfg.num_envs * cfg.algo.steps_per_env * (ITERATIONS + 2)  # two of them as a warm-up
+    frames = cfg.num_envs * cfg.algo.steps_per_env * (ITERATIONS + 2)  # two iterations as a warm-up
     trainer_cfg = TrainerCfg(cfg.algo, 0, frames, None, 0, 1e9, "cpu", threads)
     Trainer(FreeEnv(cfg.num_envs), trainer_cfg, Extras(callbacks=[ticks])).run()
     return 1e3 * float(np.median(np.diff(ticks.at_s[1:])))
 
 
 def first_step_s(task: str) -> float:
-    """Return s from a fresh process's import to its first step."""
+    """Return the time from the import to the first step in a new process, s."""
     code = FIRST_STEP.format(task=task)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return float(done.stdout)
@@ -234,7 +234,7 @@ def first_step_s(task: str) -> float:
 def peak_memory_mib(task: str, *overrides: str) -> float:
     """Return the peak resident memory of a short `pgdm-run` with a video.
 
-    Pages of a replay that are in memory count; the system reclaims them when it needs them.
+    This includes pages of a replay in memory, which the system reclaims when it needs them.
     """
     with tempfile.TemporaryDirectory() as folder:
         command = [str(Path(sys.executable).with_name("pgdm-run")), f"task={task}", "--offline"]
@@ -244,7 +244,7 @@ def peak_memory_mib(task: str, *overrides: str) -> float:
 
 
 def measure_round(task: str) -> dict[str, float]:
-    """Return one value of each row that any checkout has."""
+    """Return one value for each row that can be measured in any checkout."""
     # torch's helper threads spin after each parallel call, on a core that the physics needs.
     torch.set_num_threads(1)
     builder = env_builder(compose([f"task={task}"]), open_library())
@@ -272,7 +272,7 @@ def measure_round(task: str) -> dict[str, float]:
 
 def measure(task: str, rounds: int, console: Console) -> dict[str, list[float]]:
     """Return the values of each row, one per round."""
-    from loss_cost import measure_losses  # of parts that another checkout may not have
+    from loss_cost import measure_losses  # rows that another checkout may not have
 
     values: dict[str, list[float]] = {}
     for number in range(rounds):
@@ -287,7 +287,7 @@ def compare(task: str, rounds: int, other: Path, console: Console) -> None:
     checkouts = {"other": other.resolve(), "this": HERE}
     found: dict[str, dict[str, list[float]]] = {name: {} for name in checkouts}
     for number in range(rounds):
-        for name in list(checkouts)[:: 1 - 2 * (number % 2)]:  # the first one changes
+        for name in list(checkouts)[:: 1 - 2 * (number % 2)]:  # the order alternates
             with console.status(f"round {number + 1} of {rounds}, {name}"):
                 for row, value in in_checkout(checkouts[name], task).items():
                     found[name].setdefault(row, []).append(value)
@@ -329,7 +329,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--write", action="store_true", help=f"store the values in {RESULT.name}")
     parser.add_argument("--methods-only", action="store_true", help="only the methods' rows")
-    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="compare with another one")
+    parser.add_argument(
+        "--against", type=Path, metavar="CHECKOUT", help="compare with another checkout"
+    )
     parser.add_argument("--one-round", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.write and (options.methods_only or options.against):

@@ -1,8 +1,8 @@
-"""How closely the hand can follow each motion: by geometry, and simulated without the object.
+"""Measure how closely hands can follow the motions: by geometry, and simulated without the object.
 
-    python benchmark/wrist.py                plan what is missing of all 51 tasks, print the table
+    python benchmark/wrist.py                plan all 51 tasks unless stored, print the table
     python benchmark/wrist.py quick6         only the tasks of a suite
-    python benchmark/wrist.py --table        print the table of what is stored
+    python benchmark/wrist.py --table        print the table of the stored results
 
 Results are stored task by task in results/wrist.json; plans are stored in the library, where
 runs find them. Times are comparable only if the machine is idle.
@@ -39,7 +39,7 @@ TASKS = (*suite("tcdm50"), "dmanus-sim2real")
 
 
 def key(task: str) -> str:
-    """Return what a row depends on, as a hash."""
+    """Return a hash of everything that a row depends on."""
     cfg = compose([f"task={task}", "+experiment=fast", "action.wrist_path=clipped"])
     return env_builder(cfg, assets(cfg, print), print).wrist_problem.key()
 
@@ -100,7 +100,7 @@ def grasp_errors(
     """Return the grasp point's distance from the motion on a path, (T,) m.
 
     Args:
-        index: of the scene.
+        index: index of the scene.
         reference: the exemplar motion.
         start: qpos (nq,) at the start.
         path: base joints (T, 6), m and rad.

@@ -1,8 +1,9 @@
 """Compute the start states of the animated tasks: ``python tools/animated_starts.py [TASK...]``.
 
 For each file in src/pgdm/library/keyframes: the object settles on the table, a contact-free hand
-pose is searched near it (pgdm.pregrasp.near), and both joint positions are written into the file as
-``start``. Needs a library with hands and objects. Prints and draws the result.
+pose near the object is searched (pgdm.pregrasp.near), and the joint positions of both are written
+into the file as ``start``. Needs a library with hands and objects. Prints the result and draws it
+into the folder for temporary files.
 """
 
 from __future__ import annotations

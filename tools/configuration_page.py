@@ -35,8 +35,8 @@ exist, or a value of the wrong type, is an error before anything starts.
 Your own settings go into a folder with the same layout: with `--config-dir my`, the file
 `my/experiment/ours.yaml` is `+experiment=ours`, and `my/task/mine.yaml` is `task=mine`.
 Reusing a group and name of pgdm's own files is an error. A settings file may have up to
-{MOST_TEXT_BYTES >> 20} MiB, {MOST_NODES:,} values and {MOST_DEPTH} levels, names no code to run
-(`_target_`, Hydra's callbacks) and sets up no logging.
+{MOST_TEXT_BYTES >> 20} MiB, {MOST_NODES:,} values and {MOST_DEPTH} levels, must not name code to
+run (`_target_`, Hydra's callbacks) or set up logging.
 """
 
 

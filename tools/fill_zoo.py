@@ -1,10 +1,10 @@
 """Put the finished runs of a folder into the zoo: ``python tools/fill_zoo.py FOLDER``.
 
-FOLDER is that of a sweep, or any folder of runs; it is only read. A run that goes on, or did not
-finish, is left out, and so is one whose entry exists; a second call adds what has finished since.
-An entry has the name of its task; of several runs of a task that with the lowest seed is taken,
-others are named ``<task>-s<seed>`` with --all-seeds. Every policy is evaluated, which takes about a
-minute; Ctrl-C ends between two of them.
+FOLDER is a sweep or any folder of runs; it is only read. Runs that have not finished are left out,
+and so are runs whose entry exists; a second call adds runs that have finished since. An entry has
+the name of its task. Of several runs of a task, the run with the lowest seed is taken; with
+--all-seeds the others are added as ``<task>-s<seed>``. Evaluating a policy takes about a minute;
+Ctrl-C stops without adding the policy that is being evaluated.
 """
 
 from __future__ import annotations
@@ -70,8 +70,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", type=Path, help="folder of a sweep or of runs")
     parser.add_argument("--zoo", type=Path, default=ZOO, help="folder of the zoo [zoo]")
-    parser.add_argument("--replace", action="store_true", help="make existing entries anew")
-    parser.add_argument("--all-seeds", action="store_true", help="add every seed of a task")
+    parser.add_argument("--replace", action="store_true", help="replace existing entries")
+    parser.add_argument(
+        "--all-seeds", action="store_true", help="add the runs of all seeds of a task"
+    )
     options = parser.parse_args()
     try:
         return fill(options.folder, options.zoo, options.replace, options.all_seeds)

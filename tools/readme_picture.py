@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "quickstart.jpg"
-MOMENTS = (0.05, 0.45, 0.85)  # shares of the video
-WIDTH = 400  # of each, pixels
+MOMENTS = (0.05, 0.45, 0.85)  # as fractions of the video
+WIDTH = 400  # width of each moment's picture, pixels
 
 
 def frames(video: Path) -> list[Image.Image]:
