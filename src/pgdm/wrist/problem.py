@@ -31,9 +31,7 @@ class WristProblem:
     reference: ObjectReference
     qpos: np.ndarray  # (nq,) m, rad: the start state
     qvel: np.ndarray  # (nv,) m/s, rad/s
-    fingers: (
-        np.ndarray
-    )  # (nu,) m, rad: constant actuator targets of the other joints; the base's unused
+    fingers: np.ndarray  # (nu,) m, rad: constant actuator targets; the base's entries are unused
     substeps: int
     """Physics steps per control step."""
     hold_steps: int = 0
