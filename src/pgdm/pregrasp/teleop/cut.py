@@ -65,8 +65,7 @@ LAYOUTS = {
 class Replay:
     """A demonstration set in the task's scene."""
 
-    number: int
-    """Number of the demonstration in its file, from 0."""
+    number: int  # of the demonstration in its file, from 0
     qpos: np.ndarray = field(repr=False)
     """Whole scene (T, nq) at each step, the hand's joints clipped to their ranges."""
     shift_m: float
