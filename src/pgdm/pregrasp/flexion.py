@@ -11,7 +11,7 @@ from pgdm.sim.scene import Scene
 
 _SAMPLES = 21  # angles tried between a joint's zero and each of its limits
 _LEAST_M = 0.01  # a thumb joint closes only if it brings the tip nearer to the palm by more
-_BENDS = 0.5  # a joint closes if the cosine between its tip's motion and the palm's normal exceeds
+_BENDS = 0.5  # other joints close if the tip's motion has this cosine to the palm's normal, or more
 
 
 class Flexion:

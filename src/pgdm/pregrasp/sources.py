@@ -184,7 +184,7 @@ def _fitting(start: StartState, scene: Scene) -> StartState:
         raise ConfigError(
             f"start '{start.source}' of task '{scene.task.id}' has {start.qpos.size} positions and "
             f"{start.qvel.size} velocities, the scene with hand '{scene.hand.name}' has "
-            f"{model.nq} and {model.nv}; pregrasp=planned computes one for another hand, "
+            f"{model.nq} and {model.nv}; pregrasp=planned computes a start for this hand, "
             "pregrasp=none starts from its reset pose"
         )
     return start

@@ -65,13 +65,13 @@ class AblationCfg:
         if (self.name == "none") == self.changes_start:
             raise ConfigError(
                 f"ablation.name is '{self.name}' with ablation.fingers '{self.fingers}' and "
-                f"ablation.distance_m {self.distance_m}; the name 'none' is for fingers=keep with "
-                "distance_m=0, and only for that"
+                f"ablation.distance_m {self.distance_m}; use the name 'none' if fingers=keep and "
+                "distance_m=0, and another name otherwise"
             )
         if source == "none" and self.changes_start:
             raise ConfigError(
                 f"ablation={self.name} changes the pre-grasp, but pregrasp=none starts without "
-                "one: nothing is left to ablate; use ablation=none, or another pregrasp"
+                "a pre-grasp: nothing is left to ablate; use ablation=none, or another pregrasp"
             )
 
 
@@ -87,7 +87,7 @@ class Ablated:
     finger_error_rad: float
     """Largest error of a finger joint."""
     object_moved_m: float
-    """How far the fingers pushed the object in the simulation; the start has it where it was."""
+    """How far the fingers pushed the object in simulation; in the start it is back in place."""
     simulated: bool
     """Whether the fingers can move there in simulation; else the pose is only set kinematically."""
     depth_m: float
@@ -135,12 +135,12 @@ def ablate(cfg: AblationCfg, start: StartState, scene: Scene, substeps: int) -> 
     it, up to the limit of a slide. If the hand then penetrates something, deeper than in the stored
     start or than :data:`OVERLAP_M`, one of two compromises is made, whichever deviates less: the
     hand retreats further, back, up or away from the object; or each finger stops at the first
-    contact on its way from the pre-grasp. That way is then checked in simulation, where it must not
-    push the object (unless the stored start already penetrates deeply). Equal arguments give an
+    contact on its way from the pre-grasp. This motion is then checked in simulation, where it must
+    not push the object (unless the stored start already penetrates deeply). Equal arguments give an
     equal result.
 
     Args:
-        cfg: what to remove.
+        cfg: the ablation.
         start: the stored start state.
         scene: scene of the task.
         substeps: physics steps per control step.

@@ -72,7 +72,7 @@ def propose(
     frame = GraspFrame(scene, predictor.anchor_m)
     if len(predictor.mean) != frame.size:
         raise ConfigError(
-            f"the predictor of hand '{predictor.hand}' gives {len(predictor.mean)} numbers, task "
+            f"predictor of hand '{predictor.hand}' gives {len(predictor.mean)} numbers, but task "
             f"'{scene.task.id}' needs {frame.size}: train it again (pgdm pregrasp train)"
         )
     vectors = predictor.sample(object_code(scene, objects), OVERSAMPLING * count, seed)

@@ -103,8 +103,8 @@ class Goal:
         target = np.asarray(target_qpos, float)
         if target.shape != (model.nq,) or not np.isfinite(target).all():
             raise SceneError(
-                f"a target of shape {target.shape} cannot be reached: the scene of task "
-                f"'{scene.task.id}' with hand '{scene.hand.name}' has {model.nq} finite positions"
+                f"a target of shape {target.shape} does not fit: the scene of task "
+                f"'{scene.task.id}' with hand '{scene.hand.name}' needs {model.nq} finite positions"
             )
         self.qpos, self._n, self._base = target, index.num_joints, index.num_base_joints
         low = np.maximum(model.jnt_range[: self._n, 0], index.joint_low)

@@ -11,7 +11,7 @@ The actuator targets compensate the lag of a servo with damping d, gain k_p and 
 
     u = q + d/k_p qdot + M/k_p qddot
 
-Only the hand's kinematics and servos, and the object's centre of mass, are used, no contacts.
+Only the hand's kinematics and servos, and the object's centre of mass, are used; contacts are not.
 """
 
 from __future__ import annotations

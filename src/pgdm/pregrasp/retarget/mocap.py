@@ -143,7 +143,7 @@ def frame_before_contact(recording: Recording, library: Library, scene: Scene) -
     if not scene.lies_free:
         raise ConfigError(
             f"{recording.origin}: has {count} frames, and the object of task '{scene.task.id}' "
-            "is attached to something, so that contact cannot be detected: choose one with --frame"
+            "is attached to something, so that contact cannot be detected: choose a frame (--frame)"
         )
     xml = library.object_xml(scene.task.objects[0], scene.asset_source)
     joints = np.stack([hand.joints for hand in recording.frames])
@@ -206,7 +206,7 @@ def check(made: Retargeted, scene: Scene) -> None:
     if errors.mean() > FAR_M or depth > DEEP_M:
         raise ConfigError(
             f"hand '{scene.hand.name}' cannot do task '{scene.task.id}': "
-            f"{'; '.join(made.unreachable)}. Pose it by hand (pgdm pregrasp label), or start "
+            f"{'; '.join(made.unreachable)}. Pose it yourself (pgdm pregrasp label), or start "
             "without a pre-grasp (pregrasp=none)"
         )
 

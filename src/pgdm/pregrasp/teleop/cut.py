@@ -121,7 +121,7 @@ def replay(scene: Scene, demonstration: Demonstration) -> Replay:
     if missed > FITS_M:
         raise ConfigError(
             f"demonstration {demonstration.number}: the palm is up to {1e3 * missed:.0f} mm from "
-            f"where it was observed; it is from another hand than that of {layout.environment}"
+            f"its observed position; recorded with another hand than that of {layout.environment}"
         )
     slides += axes @ shift
     low, high = model.jnt_range[:n].T
@@ -143,8 +143,8 @@ def _check(scene: Scene, demonstration: Demonstration, layout: Layout) -> None:
         )
     if (hand := layout.palm_site.partition("/")[0]) != scene.hand.name:
         raise ConfigError(
-            f"demonstrations of {scene.task.id} are of hand {hand}, not {scene.hand.name}; follow "
-            f"them with another hand by pgdm pregrasp mocap {scene.task.id} --hand"
+            f"demonstrations of {scene.task.id} are of hand {hand}, not {scene.hand.name}; for "
+            f"another hand use 'pgdm pregrasp mocap {scene.task.id} --hand NAME'"
         )
 
 
@@ -192,7 +192,7 @@ def cut(scene: Scene, made: Replay, objects: np.ndarray, origin: str) -> Pregras
         raise ConfigError(f"{label}: the hand already holds something in the first step")
     if made.beyond_m > BEYOND_M:
         raise ConfigError(
-            f"{label}: its object is {1e2 * made.shift_m:.0f} cm from the task's, and the slides "
+            f"{label}: the object is {1e2 * made.shift_m:.0f} cm from the task's, and the slides "
             f"of hand '{scene.hand.name}' would have to exceed their ranges by "
             f"{1e3 * made.beyond_m:.0f} mm to follow; choose another demonstration"
         )
@@ -229,6 +229,6 @@ def nearest(replays: list[Replay]) -> Replay:
     fit = [r for r in replays if r.hold and r.beyond_m <= BEYOND_M]
     if not fit:
         raise ConfigError(
-            f"none of {len(replays)} demonstrations takes hold where the hand can get"
+            f"none of {len(replays)} demonstrations takes hold within the ranges of the slides"
         )
     return min(fit, key=lambda r: (r.shift_m, r.number))

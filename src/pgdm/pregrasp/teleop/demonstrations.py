@@ -96,7 +96,9 @@ def _read_hdf5(path: Path) -> list[Demonstration]:
                 label = f"{path}, {name}"
                 data = group.get("observations") if isinstance(group, h5py.Group) else None
                 if not isinstance(data, h5py.Dataset) or (data.size or 0) > 100 * MAX_STEPS:
-                    raise CorruptAssetError(f"{label}: lacks an array 'observations'")
+                    raise CorruptAssetError(
+                        f"{label}: array 'observations' is missing or too large"
+                    )
                 found.append(_checked({"observations": data[()]}, number, label))
     except (OSError, RuntimeError, KeyError) as error:
         raise CorruptAssetError(f"{path}: not readable as HDF5 ({reason(error)})") from error
