@@ -44,7 +44,7 @@ class ObjectReference:
         return cls(torch.as_tensor(motion.translation), torch.as_tensor(motion.orientation))
 
     def com_corrected(self, com: Tensor) -> ObjectReference:
-        """Return a reference to the centre of mass, from one whose poses are the body origin's.
+        """Return targets for the centre of mass, if stored poses are those of the body's origin.
 
         Positions become x_t + R(x_t) com; orientations stay.
 
