@@ -137,7 +137,7 @@ class Poses:
         return qpos[: self._n]
 
     def _with(self, joints: np.ndarray, origin: str, notes: tuple[str, ...] = ()) -> Loaded:
-        """Return a pose with the given hand joints, clipped to their limits; a note reports this."""
+        """Return a pose with the given hand joints, clipped to their limits (with a note)."""
         low, high = self._scene.model.jnt_range[: self._n].T
         inside = joints.clip(low, high)
         beyond = np.abs(joints - inside)
