@@ -1,4 +1,4 @@
-"""The exemplar motion of the object, and the expert's motion of the hand: immutable, by step."""
+"""Immutable references, indexed by control step: the object's motion and the expert's hand."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ TIME_FREQUENCIES = (1, 4, 6, 8)
 
 @dataclass(frozen=True)
 class ReferenceCfg:
-    """How stored poses become targets."""
+    """How the stored poses of a motion become targets."""
 
     frame: str
-    """``released``: the stored position is the target of the centre of mass, as published;
-    ``com_corrected``: it is the position of the mesh's origin, as recorded, and the target is the
-    centre of mass of the object there."""
+    """``released``: stored positions are used as targets of the centre of mass, as in the released
+    code; ``com_corrected``: stored positions are those of the mesh's origin, as recorded, and each
+    target is the centre of mass of the object in that pose."""
 
 
 FRAMES = ("released", "com_corrected")
@@ -40,13 +40,13 @@ class ObjectReference:
 
     @classmethod
     def of(cls, motion: Motion) -> ObjectReference:
-        """Return a stored motion as a reference, targets as published."""
+        """Return a stored motion as a reference, with positions as in ``released``."""
         return cls(torch.as_tensor(motion.translation), torch.as_tensor(motion.orientation))
 
     def com_corrected(self, com: Tensor) -> ObjectReference:
-        """Return targets of the centre of mass, taking the poses as those of the body's origin.
+        """Return targets for the centre of mass, if stored poses are those of the body's origin.
 
-        x_t + R(x_t) com, with the orientation unchanged.
+        Positions become x_t + R(x_t) com; orientations stay.
 
         Args:
             com: (3,) m, the centre of mass in the body's frame.
@@ -59,7 +59,7 @@ class ObjectReference:
         return self.pos.shape[0]
 
     def ahead(self) -> Tensor:
-        """Return the observed future targets at every step t, (T, 21) (released code).
+        """Return the future targets that are observed at each step t, (T, 21) (released code).
 
         For each k of ``STEPS_AHEAD``: orientation (4), then position (3) of x_{min(t+k, T-1)}.
         """
@@ -76,26 +76,26 @@ class ObjectReference:
 
 @dataclass(frozen=True)
 class ExpertReference:
-    """A person's hand along the exemplar motion, float64; row t belongs to pose t of the motion."""
+    """The expert's hand along the motion, float64; row t belongs to pose t of the motion."""
 
     joints: Tensor
-    """(T, nu) joints of the Adroit hand, clipped to their limits, m and rad."""
+    """(T, nu) joint positions of the Adroit hand, clipped to their limits, m and rad."""
     fingertips: Tensor
-    """(T, F, 3) m, its fingertips, world frame."""
+    """(T, F, 3) m, fingertips of the Adroit hand, world frame."""
     contacts: Tensor
-    """(T, F, 3) m, the points of the object that the human fingers touch or are closest to: from
-    its centre of mass, in its body's frame."""
+    """(T, F, 3) m, the object's surface point that each human finger touches or is closest to,
+    relative to the object's centre of mass, in the object body's frame."""
     in_contact: Tensor
-    """(T, F) bool, whether the finger touches the object."""
+    """(T, F) bool, whether the human finger touches the object."""
 
     @classmethod
     def of(
         cls, expert: Expert, joint_low: Tensor, joint_high: Tensor, com: Tensor
     ) -> ExpertReference:
-        """Return the motion of a stored expert.
+        """Return a stored expert as a reference.
 
         Args:
-            expert: expert of the library.
+            expert: expert from the library.
             joint_low: lower limits of the hand's joints, (nu,) m and rad.
             joint_high: upper limits, (nu,).
             com: (3,) m, the object's centre of mass in its body's frame.
@@ -113,12 +113,12 @@ class ExpertReference:
         return self.joints.shape[0]
 
     def contact_points(self, t: Tensor, com: Tensor, quat: Tensor) -> Tensor:
-        """Return the contact points of steps ``t`` on the object in a given pose.
+        """Return the expert's contact points at steps ``t``, with the object in given poses.
 
         Args:
             t: (n,) steps since reset.
             com: (n, 3) m, the object's centre of mass, world frame.
-            quat: (n, 4) wxyz, its body's orientation.
+            quat: (n, 4) wxyz, orientation of the object's body.
 
         Returns:
             (n, F, 3) m, world frame.

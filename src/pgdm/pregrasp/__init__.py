@@ -1,1 +1,1 @@
-"""Pre-grasps: where an episode starts."""
+"""Pre-grasps, in which episodes start: obtained, checked, reached and ablated."""

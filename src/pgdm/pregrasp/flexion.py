@@ -1,4 +1,4 @@
-"""Which way fingers close and where the palm faces, read from a hand's kinematics."""
+"""Which way the fingers close and the palm faces, derived from a hand's kinematics."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from pgdm.pregrasp.hand_geometry import opposing_finger, straight, unit
 from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
 
-_SAMPLES = 21  # of a joint's range
-_LEAST_M = 0.01  # a thumb joint that brings the tip no nearer than this only turns it
-_BENDS = 0.5  # least cosine between a tip's motion and the palm's direction for it to be bending
+_SAMPLES = 21  # angles tried between a joint's zero and each of its limits
+_LEAST_M = 0.01  # a thumb joint closes only if it brings the tip nearer to the palm by more
+_BENDS = 0.5  # other joints close if the tip's motion has this cosine to the palm's normal, or more
 
 
 class Flexion:
     """How a scene's hand closes.
 
     Args:
-        scene: its hand's joints are first in qpos.
+        scene: a scene; its hand's n joints are first in qpos.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -27,7 +27,7 @@ class Flexion:
         self._couplings = index.couplings
         contact = HandContact(scene)
         self.first = contact.first_finger_joint
-        """Finger joints are those from here to n."""
+        """Index of the first finger joint in qpos; finger joints run from here to n."""
         self.finger_of_joint = contact.finger_of_joint
         self.num_fingers = contact.num_fingers
         tips = index.point_geoms[index.fingertips]
@@ -44,16 +44,16 @@ class Flexion:
         centre = 0.5 * (knuckles.mean(0) + wrist)  # of the palm, (3,) m, with straight fingers
         normal = self._normal(knuckles.mean(0), centre)
         self.closed = self._closed(normal, centre)
-        """Angle of each finger joint when closed, (J,) rad; NaN for joints that do not close."""
+        """Angle of each finger joint when closed, (J,) rad; NaN for joints that close nothing."""
         data = self._at(self._straight)
         rotation = data.xmat[self._palm].reshape(3, 3)
         self.normal = normal @ rotation
-        """Direction the palm faces, unit (3,), in the frame of the palm's body."""
+        """Unit vector in which the palm faces (3,), in the frame of the palm's body."""
         self.centre = (centre - data.xpos[self._palm]) @ rotation
         """Middle of the palm (3,) m, in the frame of the palm's body."""
 
     def palm(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the palm's middle (3,) m and direction (3,) at qpos (nq,), world frame."""
+        """Return the palm's middle (3,) m and normal (3,) at qpos (nq,), world frame."""
         data = self._at(qpos)
         rotation = data.xmat[self._palm].reshape(3, 3)
         return data.xpos[self._palm] + rotation @ self.centre, rotation @ self.normal
@@ -65,7 +65,7 @@ class Flexion:
         return self._data
 
     def _gains(self, joint: int, tip: int, centre: np.ndarray) -> list[float]:
-        """Return how much nearer to a point each half of a joint's range can bring a tip, m."""
+        """Return how much nearer to ``centre`` a joint brings a tip, m, towards each limit."""
         gains = []
         for end in self._model.jnt_range[joint]:
             joints, far = self._straight.copy(), []
@@ -84,7 +84,7 @@ class Flexion:
         return (self.first + np.flatnonzero(self.finger_of_joint == finger)).tolist()
 
     def _normal(self, knuckles: np.ndarray, centre: np.ndarray) -> np.ndarray:
-        """Return the direction (3,) in which the fingers other than the thumb bend."""
+        """Return the unit vector (3,), world frame, along which the fingers but the thumb bend."""
         swings = []
         for finger in self._others:
             tip = self._tips[finger]
@@ -97,7 +97,7 @@ class Flexion:
         return unit(swing - along * (along @ swing))
 
     def _closed(self, normal: np.ndarray, centre: np.ndarray) -> np.ndarray:
-        """Return the end of its range (J,) towards which each joint bends its finger, or NaN."""
+        """Return each joint's limit (J,) towards which it closes its finger; NaN if neither."""
         closed = np.full(len(self.finger_of_joint), np.nan)
         for finger, tip in self._tips.items():
             for joint in self._joints(finger):

@@ -1,4 +1,4 @@
-"""Where a scene's hand is mounted, which finger is its thumb, and where it is from the object."""
+"""Geometry of a scene's hand: mount, base joints, straight and mean fingers, thumb."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pgdm.sim.scene import Scene
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """Return the unit vector along a vector; zero for the zero vector."""
+    """Return a vector divided by its length; the zero vector stays zero."""
     return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
 def mount_rotation(scene: Scene) -> np.ndarray:
-    """Return the rotation (3, 3) from the mount's frame, in which the base slides, to the world."""
+    """Return the rotation (3, 3) from the mount's frame, that of the base joints, to the world."""
     mount = np.empty(9)
     mujoco.mju_quat2Mat(mount, scene.index.mount_quat)
     return mount.reshape(3, 3)
@@ -27,15 +27,15 @@ def mount_rotation(scene: Scene) -> np.ndarray:
 def base_joints(
     scene: Scene, position: np.ndarray, rotation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return base joint positions that bring the mount's body to a pose, whatever their limits.
+    """Return base joint positions that bring the mount body to a pose; limits are ignored.
 
     Args:
-        scene: its base has three slides, then three hinges about X, Y and Z in turn.
-        position: position of the body's origin (3,) m, world frame.
-        rotation: orientation of the body (3, 3), world frame.
+        scene: a scene; its base has three slides, then intrinsic X-Y-Z hinges.
+        position: position of the mount body's origin (3,) m, world frame.
+        rotation: orientation of the mount body (3, 3), world frame.
 
     Returns:
-        The slides (3,) m, and the two triples of hinge angles with that rotation, (2, 3) rad.
+        The slides (3,) m, and the two triples of hinge angles that give the rotation, (2, 3) rad.
     """
     mount, quat = mount_rotation(scene), np.empty(4)
     mujoco.mju_mat2Quat(quat, (mount.T @ rotation).ravel())
@@ -53,24 +53,27 @@ def posed(scene: Scene, qpos: np.ndarray) -> mujoco.MjData:
 
 
 def object_to_hand(scene: Scene, qpos: np.ndarray) -> np.ndarray:
-    """Return the vector (3,) m from the object's centre of mass to the mean hand point."""
+    """Return the vector from the object's centre of mass to the mean of the hand's tracked points.
+
+    It is (3,) m, world frame.
+    """
     data = posed(scene, qpos)
     points = data.geom_xpos[scene.index.point_geoms]
     return points.mean(axis=0) - data.xipos[scene.index.object_body]
 
 
 def straight(scene: Scene) -> np.ndarray:
-    """Return the hand's joints (n,) at zero, or at the end of their range that is nearest to it."""
+    """Return the hand's joints (n,) at zero, or at the limit nearest to zero."""
     index = scene.index
     joints = np.zeros(index.num_joints).clip(*scene.model.jnt_range[: index.num_joints].T)
     return index.couplings.apply(joints)
 
 
 def opposing_finger(scene: Scene, contact: HandContact) -> int:
-    """Return the thumb's number.
+    """Return the index of the thumb among the fingers of ``contact``.
 
-    It is the finger that follows the human thumb; if the settings name none, the one whose tip is
-    farthest from the others', with straight fingers.
+    It is the finger that ``hand.human_fingers`` assigns to the human thumb; without a complete
+    assignment, the finger whose tip is farthest from the mean of the others', when straight.
     """
     model, index, human = scene.model, scene.index, scene.hand.human_fingers
     if "thumb" in human and len(human) == len(index.fingertips):
@@ -89,7 +92,7 @@ def mean_fingers(scene: Scene) -> np.ndarray:
     """Return finger joint positions (J,) rad of the hand's mean pre-grasp.
 
     Raises:
-        ConfigError: the hand's configuration has another number of them than the hand.
+        ConfigError: ``hand.mean_fingers_rad`` has another length than the finger joints.
     """
     hand = scene.hand
     count = scene.index.num_joints - hand.num_base_joints - hand.num_wrist_joints

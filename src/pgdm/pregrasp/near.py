@@ -1,6 +1,6 @@
-"""A hand held around an object without touching it: a pre-grasp for a task that has none.
+"""Searches hand poses around an object that do not touch it: pre-grasps for a task without any.
 
-A cross-entropy search over the hand's joints, started from several directions of the wrist. It
+A cross-entropy search over the hand's joints, started from several orientations of the base. It
 minimises, over poses h within the joints' limits,
 
     mean_f |d_f - d*|  +  sum_k w_k c_k(h)
@@ -8,14 +8,15 @@ minimises, over poses h within the joints' limits,
 with d_f the distance of fingertip f from the object and d* :data:`TIP_DISTANCE_M`. The terms c_k,
 weighted by ``_WEIGHTS``:
 
-- depth: sum over contacts of how much they are closer than :data:`CLEARANCE_M`, m
+- depth: amount by which contacts are closer than :data:`CLEARANCE_M`, summed, m
 - middle: distance of the object's centre of mass from the point halfway between the thumb's tip
   and the mean of the other tips, m
-- across: |u_thumb + u_others| of the mean unit vectors from the centre of mass to the tips, 0 if
-  the thumb opposes the others
-- posture, wrist: mean squared angle of the fingers from a given posture, of the wrist from rest
-- tendons: angle by which coupled joints exceed their tendon's range, rad
-- beyond: the caller's own objection to the pose
+- across: |u_thumb + u_others|, with u the mean unit vectors from the centre of mass to the tips; 0
+  if the thumb opposes the other fingers
+- posture: mean squared difference of the finger joints from a given posture, rad^2
+- wrist: mean squared angle of base hinges and wrist joints, rad^2
+- tendons: angle by which joints exceed the range of a tendon that couples them, rad
+- beyond: a further cost, computed by the caller's function
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ from pgdm.sim.contact import FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
 CLEARANCE_M = 0.003
-"""Distance that the search keeps; in a pose that it returns the hand touches at most itself."""
+"""Distance from everything else that the search aims for; returned poses at least do not touch."""
 TIP_DISTANCE_M = 0.015
-"""Wanted distance of the fingertips from the object."""
+"""Desired distance of the fingertips from the object."""
 
 STARTS, ROUNDS = 8, 30
-_SPREAD = (0.04, 0.3, 0.2)  # standard deviation of the first samples: slides m, hinges, fingers rad
+_SPREAD = (0.04, 0.3, 0.2)  # first standard deviations: slides m, base hinges, other joints rad
 _CEM = CemCfg(48, 8, added=0.03)
-_WRIST_RAD = (0.7, 0.7, 1.3)  # starting directions of the wrist: largest angle about each axis
+_WRIST_RAD = (0.7, 0.7, 1.3)  # largest starting angle of each base hinge
 _WEIGHTS = {
     "depth": 20.0,
     "middle": 0.5,
@@ -57,15 +58,15 @@ _WEIGHTS = {
 
 @dataclass(frozen=True)
 class NearPose:
-    """A pose that the search found."""
+    """A pose found by the search."""
 
     qpos: np.ndarray  # (nq,) whole scene
     cost: float
-    tip_distances_m: np.ndarray  # (F,) from the fingertips' links to the object
+    tip_distances_m: np.ndarray  # (F,) distance from each finger's last link to the object
 
 
 Beyond = Callable[[np.ndarray], float]
-"""qpos (nq,) -> how far the base would leave its range along the motion, m or rad; 0 is best."""
+"""Maps qpos (nq,) to how far the base would exceed its range along the motion, m or rad."""
 
 
 def poses_near(
@@ -84,13 +85,13 @@ def poses_near(
         fingers: posture (J,) rad that the finger joints should stay near.
         beyond: further cost of a pose.
         seed: seed of the search.
-        progress: called once per starting direction.
+        progress: called before each start of the search, and at the end.
 
     Returns:
-        Poses that touch nothing, the best first.
+        Poses in which the hand touches nothing but itself, best first.
 
     Raises:
-        SceneError: none was found.
+        SceneError: no such pose was found.
     """
     search = _Search(scene, np.asarray(qpos, float), fingers, beyond)
     stream = seeding.numpy_stream(seed, "near")
@@ -110,7 +111,7 @@ def poses_near(
 
 
 class _Search:
-    """The search in one scene, and the cost of a pose there."""
+    """The search in one scene, with the cost of a pose."""
 
     def __init__(self, scene: Scene, qpos: np.ndarray, fingers: np.ndarray, beyond: Beyond) -> None:
         self._scene, self._qpos, self._beyond = scene, qpos, beyond
@@ -136,7 +137,7 @@ class _Search:
         self._distance = FingertipDistance(scene)
 
     def run(self, stream: np.random.Generator, first: bool) -> NearPose | None:
-        """Search from one direction of the wrist: at rest if ``first``, else a random one."""
+        """Search from one orientation of the base: hinges at zero if ``first``, else random."""
         start = self._posture.copy()
         limits = np.array(_WRIST_RAD[: self._base - 3])
         start[3 : self._base] = 0.0 if first else stream.uniform(-limits, limits)
@@ -192,7 +193,7 @@ class _Search:
         mujoco.mj_tendon(self._model, self._data)
 
     def _middle(self) -> np.ndarray:
-        """Return the point (3,) m, world frame, between the thumb's tip and the others' mean."""
+        """Return the point halfway between the thumb's tip and the mean of the others, (3,) m."""
         tips = self._data.geom_xpos[self._tips]
         return 0.5 * (tips[self._thumb].mean(axis=0) + tips[~self._thumb].mean(axis=0))
 
@@ -206,10 +207,10 @@ class _Search:
 
 
 class _Tendons:
-    """How far joints exceed the range of limited tendons, where no servo can bring them.
+    """How far joints exceed the range of limited tendons, where servos cannot bring them.
 
     Args:
-        model: only its fixed tendons count; their length is a weighted sum of joint angles.
+        model: a model; only fixed tendons count, whose length is a weighted sum of joint angles.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -221,7 +222,7 @@ class _Tendons:
         self._range = model.tendon_range[self._which]
 
     def beyond_rad(self, data: mujoco.MjData) -> float:
-        """Return the excess summed over tendons, as the angle of the joint with the longest arm."""
+        """Return the excess summed over tendons, as the angle of each one's longest-arm joint."""
         length = data.ten_length[self._which]
         over = np.maximum(self._range[:, 0] - length, length - self._range[:, 1]).clip(0.0)
         return float((over / self._arms).sum())

@@ -1,8 +1,8 @@
-"""Computes the start that a run asks for, if none is stored and no person is needed for it.
+"""Computes the start state that a run asks for, if none is stored and no person is needed.
 
-Three sources qualify: ``mocap``, from a human hand's joints; ``planned`` for a hand that is not the
-task's own: the same pre-grasp, and the state in which a reach plan ends there; and ``learned``,
-once the user has trained a predictor for the hand.
+Three pre-grasp sources qualify: ``mocap``, from a human hand's joints; ``planned``, for a hand that
+is not the task's own, obtained in the same way; and ``learned``, once the user has trained a
+predictor for the hand. If a reach plan succeeds, the start is the state in which it ends.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from pgdm.pregrasp.retarget.recording import Recording
 from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
 
 DEEPER_M = 0.001
-"""A plan that ends with a deeper penetration than this is rejected."""
+"""A reach plan is rejected if it ends in a deeper penetration than this, or the pre-grasp's."""
 FARTHEST = 3.0
-"""So is one that ends farther from the pre-grasp than this many times the reach's tolerances."""
+"""A reach plan is rejected if its error exceeds this many times the reach's tolerances."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """A start to compute, and the task and hand it is for."""
+    """A start state to compute, and the task and hand that it is for."""
 
     task: TaskCfg
     hand: HandCfg
-    """The hand that is to do the task."""
+    """The hand that is used for the task."""
     own_hand: HandCfg
-    """The task's own hand."""
+    """The hand that the task was published with."""
     sim: SimCfg
     source: str
     """``pregrasp.source``."""
 
     @property
     def path(self) -> Path:
-        """File of the user's own start of this source."""
+        """File of the user's own pre-grasp of this source."""
         return pregrasp_file.path_of(self.task.id, self.hand.name, self.source)
 
     @property
@@ -66,7 +66,7 @@ class Wanted:
 
     @property
     def is_other_hand(self) -> bool:
-        """Whether the hand is not the task's own, so that no start of the motion fits it."""
+        """Whether the hand is not the task's own: starts stored with the motion do not fit it."""
         return self.hand.name != self.own_hand.name
 
 
@@ -78,14 +78,14 @@ def ensure_start(
     progress: StepProgress = silent,
     num_threads: int = 0,
 ) -> None:
-    """Compute and store a start, if it is missing and can be computed.
+    """Compute and store a start state, if it is missing and can be computed.
 
-    If several processes need it, one computes it and the others wait. The same assets give the
-    same start.
+    If several processes need the same start state, one computes it and the others wait. The result
+    depends only on the assets.
 
     Args:
         library: library with the task.
-        wanted: which start.
+        wanted: the start state to compute.
         offline: never download the human hand's joints.
         notify: receives messages on what is computed and how well it fits; by default the log.
         progress: receives the progress.
@@ -94,7 +94,7 @@ def ensure_start(
 
     Raises:
         ConfigError: the hand cannot do the task.
-        SceneError: no predicted hand can be freed from contact.
+        SceneError: no predicted pose can be freed from contact, or the simulation diverges.
         CorruptAssetError: the predictor's file is damaged.
         LibraryError: something is missing and cannot be downloaded, or the start cannot be stored.
     """
@@ -130,14 +130,14 @@ def ensure_start(
 def human_hand(
     library: Library, wanted: Wanted, motion: Motion, offline: bool, notify: Notify
 ) -> Recording:
-    """Return the human hand to follow, downloaded if it is available but not in the library.
+    """Return the human hand to follow; it is downloaded if available but not in the library.
 
     Raises:
         ConfigError: the task has neither a human hand nor a pre-grasp of its own to follow.
-        LibraryError: it cannot be downloaded.
+        LibraryError: the human hand cannot be downloaded.
     """
-    # Trajectories that would be rebuilt from another package are not worth the download: the
-    # task's own pre-grasp is as close.
+    # Hand trajectories that would be rebuilt from another package are not worth the download: the
+    # task's own pre-grasp is as good to follow.
     if motion.id not in REBUILT_EXPERTS:
         with suppress(UnknownNameError):
             library = ensure_expert(motion.id, offline, notify, library.root)
@@ -153,10 +153,10 @@ def with_plan(
     progress: StepProgress = silent,
     num_threads: int = 0,
 ) -> Pregrasp:
-    """Return a pre-grasp with the state in which a reach plan towards it ends.
+    """Plan the reach to a pre-grasp, and return the pre-grasp with the plan's final state.
 
     A plan that pushes the object away, or ends in penetration or far from the pre-grasp, is
-    rejected: episodes then start at the pose itself, set kinematically.
+    rejected: episodes then start at the pre-grasp itself, set kinematically.
     """
     target, count = pregrasp.pose.qpos, num_threads
     plan = plan_reach(scene, target, motion.substeps, num_threads=count, progress=progress)

@@ -14,7 +14,7 @@ def primitive(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     """Return the surface of a geom that is not a mesh, in the geom's frame, m.
 
     Raises:
-        SceneError: the geom is of a kind without a closed surface.
+        SceneError: the geom's type has no closed surface, such as a plane.
     """
     size, kind = model.geom_size[geom], int(model.geom_type[geom])
     if kind == _G.mjGEOM_BOX:
@@ -28,6 +28,6 @@ def primitive(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     if kind == _G.mjGEOM_CAPSULE:
         return trimesh.creation.capsule(radius=size[0], height=2 * size[1])
     raise SceneError(
-        f"geom '{model.geom(geom).name}' is of kind {_G(kind).name[7:].lower()}, without a closed "
+        f"geom '{model.geom(geom).name}' has type {_G(kind).name[7:].lower()}, without a closed "
         "surface; valid: mesh, box, sphere, ellipsoid, cylinder, capsule"
     )

@@ -1,4 +1,4 @@
-"""Quality of a pre-grasp: free of contact, near the object, facing it, and able to lift it."""
+"""Quality of a pre-grasp: is it free of contact, near the object, facing it, able to lift it?"""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from pgdm.sim.contact import FREE_M, FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
 LIFT_M = 0.02
-"""How far the object's centre of mass must rise: as far as for the reward's lift bonus."""
+"""How far the object's centre of mass must rise, the same as for the reward's lift bonus."""
 RAISE_M = 0.1
-"""How far the hand is raised, or as far as its slides go."""
+"""How far a policy raises the hand, unless a slide reaches its limit before."""
 PRESS_M = 0.03
-"""How far at most a policy pushes the palm in the direction it faces while the hand closes."""
-_SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # std of the hand's shift, and of joints that do not close
+"""Largest distance by which a policy pushes the palm forwards while the hand closes."""
+_SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # std of the hand's shift, and of joints that close nothing
 _PRESS_STEPS, _CLOSE_STEPS, _LIFT_STEPS, _HOLD_STEPS = 8, 20, 25, 15  # control steps
 _FASTEST, _SLOWEST = 4, 16  # control steps in which a finger closes
 _GRIP, _FINGER, _JOINT = (0.3, 1.0), (0.5, 1.0), (0.7, 1.3)  # factors of full flexion
@@ -34,34 +34,34 @@ class Quality:
     """Measurements of a pre-grasp."""
 
     free: bool
-    """Whether the hand touches nothing but itself."""
+    """Whether the hand touches nothing but itself (less than 0.1 mm of penetration)."""
     depth_m: float
-    """Deepest penetration of the hand and anything else."""
+    """Deepest penetration between the hand and anything else."""
     fingertip_distance_m: float
-    """Distance from the collision surface of each finger's last link to the object's, mean over
-    fingers; a link that penetrates it counts as 0."""
+    """Distance between the collision surfaces of each finger's last link and of the object, mean
+    over fingers; a link that penetrates the object counts as 0."""
     palm_angle_rad: float
-    """Angle between the direction the palm faces and that from its middle to the object's centre
-    of mass."""
+    """Angle between the palm's normal and the direction from the palm's middle to the object's
+    centre of mass."""
     lift_rate: float
-    """Share of random closing policies that lift the object and hold it; NaN if not tested, or for
-    an object that cannot be lifted, such as a door."""
+    """Share of random closing policies that lift and hold the object; NaN if not tested, or if the
+    object cannot be lifted, such as a door."""
 
 
 class LiftTest:
-    """Closes the fingers in many random ways and raises the hand: is the object lifted?
+    """The lift test: random closing policies try to lift the object from a pre-grasp.
 
-    A policy pushes the palm a little in the direction it faces and closes each finger at its own
-    speed by a random share of full flexion, then raises the hand by :data:`RAISE_M`. It succeeds
-    if the object stays :data:`LIFT_M` above its start while the hand then holds still. Equal
+    A policy pushes the palm forwards a little and closes each finger at its own random speed by a
+    random share of full flexion, then raises the hand by :data:`RAISE_M` and holds it still. It
+    succeeds if the object stays at least :data:`LIFT_M` above its start during the hold. Equal
     arguments give an equal result, whatever the number of threads.
 
     Args:
         scene: scene of the task.
         substeps: physics steps per control step.
-        num_policies: N, how many policies are tried.
+        num_policies: N, number of policies.
         seed: seed of the policies.
-        num_threads: 0 takes one per core.
+        num_threads: number of threads of the simulations; 0 takes one per core.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class LiftTest:
     ) -> None:
         self._scene, self._flexion = scene, Flexion(scene)
         self.made_for = scene.digest(), substeps
-        """Digest of the scene, and substeps, that it tests."""
+        """Digest of the scene, and number of substeps, that the test is valid for."""
         self._sim = SimBatch(scene, num_policies, num_threads, substeps)
         self._all = np.arange(num_policies)
         fingers, n = self._flexion.num_fingers, num_policies
@@ -124,10 +124,10 @@ def quality(scene: Scene, qpos: np.ndarray, substeps: int, lift: LiftTest | None
         scene: scene of the task.
         qpos: whole scene (nq,) with the hand at its pre-grasp.
         substeps: physics steps per control step.
-        lift: test of this scene, or None to skip it, as it takes a second.
+        lift: lift test of this scene, which takes about a second; None skips it.
 
     Raises:
-        ConfigError: the lift test belongs to another scene or number of substeps.
+        ConfigError: the lift test is for another scene or number of substeps.
     """
     if lift is not None and lift.made_for != (scene.digest(), substeps):
         raise ConfigError(
@@ -150,7 +150,7 @@ def quality(scene: Scene, qpos: np.ndarray, substeps: int, lift: LiftTest | None
 
 
 def _can_rise(scene: Scene) -> bool:
-    """Return whether the object has joints other than hinges, so that it can move up."""
+    """Return whether the object can move up: whether it has a joint that is not a hinge."""
     model, body = scene.model, scene.index.object_body
     while body:
         first = model.body_jntadr[body]

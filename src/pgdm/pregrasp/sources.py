@@ -1,4 +1,4 @@
-"""Start states: the stored pre-grasp of a source, or the hand's reset pose."""
+"""Start states of episodes: the stored pre-grasp of a source, or the hand's reset pose."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pgdm.sim.scene import Scene
 SOURCES = ("planned", "mined", "mocap", "teleop", "labeled", "learned", "none")
 
 LIMIT_TOLERANCE = 0.5
-"""How far, m or rad, a joint of a user's own start may exceed its limits: recordings ignore them,
-and mined pre-grasps exceed theirs by up to 0.46 rad."""
+"""How far, m or rad, a joint of the user's own pre-grasp may exceed its limits. Not zero, because
+recordings ignore limits, and even mined pre-grasps exceed them by up to 0.46 rad."""
 _CURES = {
     "planned": "Stored plans come with a TCDM checkout (pgdm assets import PATH); 'pgdm pregrasp "
     "reach {0}' computes one",
@@ -32,21 +32,21 @@ class PregraspCfg:
     """Which start state to use."""
 
     source: str
-    """``planned``: state after the reach planner moved the hand to its pre-grasp; ``mined``: the
-    task's published one, set kinematically; ``mocap``: from a human hand's joints, by inverse
-    kinematics; ``teleop``: cut from a demonstration; ``labeled``: posed by a person; ``learned``:
-    predicted from the object's shape; ``none``: the hand's reset pose. The user's
-    own pre-grasp of a source takes precedence over one stored with the motion."""
+    """``planned``: state in which the reach plan leaves the hand; ``mined``: pre-grasp published
+    with the task, set kinematically; ``mocap``: from a human hand's joints, by inverse kinematics;
+    ``teleop``: cut from a demonstration; ``labeled``: posed by a person; ``learned``: predicted
+    from the object's shape; ``none``: the hand's reset pose. The user's own pre-grasp of a source
+    takes precedence over the one stored with the motion."""
     fallback: str | None
-    """Source to use if this one is not stored for a task; None makes that an error. The asset
-    library that pgdm downloads has no plans, only mined pre-grasps."""
+    """Source to use if ``source`` is not stored for a task; None makes that an error. The assets
+    that pgdm downloads contain no plans, only mined pre-grasps."""
 
 
 @dataclass(frozen=True)
 class ReachStart:
     """The reach plan that ends in a start state."""
 
-    qpos: np.ndarray  # (nq,) m, rad: where it begins, the hand at rest in its reset pose
+    qpos: np.ndarray  # (nq,) m, rad: where the plan begins, the hand at rest in its reset pose
     actions: np.ndarray  # (K, nu) in [-1, 1]
 
 
@@ -54,21 +54,22 @@ class ReachStart:
 class StartState:
     """State in which every episode of a task starts."""
 
-    source: str  # the pre-grasp source, perhaps the fallback
+    source: str  # the pre-grasp source that was used, perhaps the fallback
     qpos: np.ndarray  # (nq,) m, rad
     qvel: np.ndarray  # (nv,) m/s, rad/s
-    sha256: str = ""  # of the file, for the user's own
+    sha256: str = ""  # hash of the file, if it is the user's own pre-grasp
     reach: ReachStart | None = None  # the plan that ends here, if one is stored
 
 
 def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
     """Return the start state of a task.
 
-    With ``none`` the object stands where the mined pre-grasp has it.
+    With ``none`` the objects are where the mined pre-grasp has them.
 
     Raises:
-        ConfigError: the source is unknown, none is stored for this task, or the stored one does
-            not fit the scene's joints.
+        ConfigError: the source is unknown or not stored for this task, or the stored state does
+            not fit the scene's joints or their limits.
+        CorruptAssetError: the file of the user's own pre-grasp is damaged.
     """
     if cfg.source not in SOURCES:
         raise ConfigError(f"pregrasp.source '{cfg.source}' is unknown; valid: {', '.join(SOURCES)}")
@@ -87,7 +88,7 @@ def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
 
 
 def stored_source(cfg: PregraspCfg, motion: Motion, task: str, hand: str) -> str | None:
-    """Return the source if it is stored, else its fallback if that is, else None."""
+    """Return the configured source if stored, else the fallback if stored, else None."""
     for source in (cfg.source, cfg.fallback):
         if source is not None and (
             source in motion.starts or pregrasp_file.path_of(task, hand, source).is_file()
@@ -97,7 +98,7 @@ def stored_source(cfg: PregraspCfg, motion: Motion, task: str, hand: str) -> str
 
 
 def _stored(source: str, motion: Motion, scene: Scene) -> StartState:
-    """Return the user's own start of a source, else the one stored with the motion."""
+    """Return the start state from the user's own pre-grasp, else from the motion's."""
     task, hand = scene.task.id, scene.hand.name
     own = pregrasp_file.find(task, hand, source)
     if own is not None:
@@ -113,7 +114,7 @@ def _stored(source: str, motion: Motion, scene: Scene) -> StartState:
 
 
 def _reach(start: Start, pose: np.ndarray, scene: Scene) -> ReachStart | None:
-    """Return the plan of a stored start; it begins with the objects as in ``pose`` (nq,)."""
+    """Return the plan of a stored start, if any; at its begin objects are as in ``pose`` (nq,)."""
     if start.actions is None or start.actions.shape[1] != scene.model.nu:
         return None
     return ReachStart(reset_pose(scene, pose), np.array(start.actions))
@@ -136,12 +137,12 @@ def reset_pose(scene: Scene, qpos: np.ndarray) -> np.ndarray:
 
 
 def is_reset_pose(scene: Scene, qpos: np.ndarray) -> bool:
-    """Return whether the hand is in its reset pose at qpos (nq,), so that this is no pre-grasp."""
+    """Return whether the hand is in its reset pose at qpos (nq,), which is no pre-grasp."""
     return np.array_equal(qpos[: scene.index.num_joints], scene.index.reset)
 
 
 def object_joints(motion: Motion, scene: Scene) -> np.ndarray:
-    """Return the objects' joints (nq - n,) where the task starts, whatever the scene's hand.
+    """Return the objects' joint positions (nq - n,) at the task's start, for any hand.
 
     Raises:
         ConfigError: the motion does not store where its objects start.
@@ -162,7 +163,7 @@ def reset_state(motion: Motion, scene: Scene) -> np.ndarray:
 
 
 def _within_limits(start: StartState, scene: Scene) -> StartState:
-    """Return a user's own start; an error if it exceeds the hand's joint limits by far."""
+    """Return a start state; raise ConfigError if it exceeds limits by ``LIMIT_TOLERANCE``."""
     model, count = scene.model, scene.index.num_joints
     hand = start.qpos[:count]
     low, high = model.jnt_range[:count].T
@@ -183,7 +184,7 @@ def _fitting(start: StartState, scene: Scene) -> StartState:
         raise ConfigError(
             f"start '{start.source}' of task '{scene.task.id}' has {start.qpos.size} positions and "
             f"{start.qvel.size} velocities, the scene with hand '{scene.hand.name}' has "
-            f"{model.nq} and {model.nv}; pregrasp=planned computes one for another hand, "
+            f"{model.nq} and {model.nv}; pregrasp=planned computes a start for this hand, "
             "pregrasp=none starts from its reset pose"
         )
     return start

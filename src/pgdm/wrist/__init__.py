@@ -1,1 +1,1 @@
-"""Paths and plans of the hand's base with which the hand follows an exemplar motion."""
+"""Wrist paths and wrist plans: base joint positions that let the hand follow a motion."""

@@ -1,4 +1,4 @@
-"""The hand alone, simulated: nothing touches the objects, and it may bear their weight."""
+"""Simulation of the hand alone: it touches no object, but may bear the weight of the task's."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class Rollout:
     qpos: np.ndarray  # (K+1, nq)
     qvel: np.ndarray  # (K+1, nv)
     points: np.ndarray  # (K, 3) m, world frame: the grasp point after each step
-    orientations: Rotation  # K, of the palm
+    orientations: Rotation  # (K,) world frame: of the palm, after each step
 
 
 class HandAlone:
-    """One simulation of a problem's hand.
+    """Simulates the hand of a wrist-plan problem without contact with objects.
 
     Args:
-        problem: start state, fingers and load.
-        scene: scene in which the hand touches no object.
+        problem: gives the start state, the finger targets and the load.
+        scene: the problem's scene, with the objects' contacts switched off.
     """
 
     def __init__(self, problem: WristProblem, scene: Scene) -> None:
@@ -43,7 +43,7 @@ class HandAlone:
         self._grasp = GraspPoint.at(problem.reference.pos.numpy()[0], pos[0], orientation[0])
 
     def rollout(self, commands: np.ndarray) -> Rollout:
-        """Return where commands (K, 6), m and rad, take the hand from its start.
+        """Return the states that base commands (K, 6), m and rad, lead to from the start state.
 
         Raises:
             SceneError: if the simulation diverges.
@@ -64,7 +64,12 @@ class HandAlone:
         )
 
     def step(self, sim: SimBatch, ctrl: np.ndarray, steps: np.ndarray) -> None:
-        """Take a control step with targets ctrl (N, nu) and the load at steps (N,) of the motion.
+        """Take a control step in each of N simulations.
+
+        Args:
+            sim: the simulations.
+            ctrl: actuator targets (N, nu).
+            steps: steps of the motion (N,), which determine the load.
 
         Raises:
             SceneError: if a simulation diverges.
@@ -78,7 +83,7 @@ class HandAlone:
             raise SceneError(f"task '{task}': the simulation of the hand alone diverged")
 
     def grasp_point(self, sim: SimBatch) -> tuple[np.ndarray, Rotation]:
-        """Return the grasp point (N, 3) m, world frame, and the palm's orientation."""
+        """Return the grasp points (N, 3) m and the palm orientations (N,), world frame."""
         pos, orientation = self._palm(sim)
         return self._grasp.of(pos, orientation), orientation
 

@@ -1,4 +1,4 @@
-"""Wrist paths along an exemplar motion: base joint positions at each step, by geometry alone."""
+"""Wrist paths: base joint positions along a motion, computed by geometry alone."""
 
 from __future__ import annotations
 
@@ -15,40 +15,45 @@ from pgdm.motion.reference import ObjectReference
 from pgdm.sim.scene import SceneIndex
 
 SLIDES, BASE_JOINTS = 3, 6
-"""The base: three slides, then three intrinsic X-Y-Z hinges, in the mount's frame, which is that of
-the mount body at base joints of zero."""
+"""Joints of the base: three slides, then three intrinsic X-Y-Z hinges. They act in the mount's
+frame, which is the frame of the mount body with all base joints at zero."""
 
 TURN_M = 0.03
-"""Metres off the path that cost as much as a radian off the carried orientation."""
-_STEADY_M = 0.003  # m that cost as much as a radian away from the step before: a smooth path
+"""Position error, m, that costs as much as 1 rad between the hand's and the carried orientation."""
+_STEADY_M = 0.003  # position error, m, that costs as much as a hinge change of 1 rad in one step
 
 
 @dataclass(frozen=True)
 class GraspPoint:
     """The point of the hand where the object's centre of mass is at the start."""
 
-    offset: np.ndarray  # (3,) m, in the frame of the body it is fixed to
+    offset: np.ndarray  # (3,) m, in the frame of the body that the point is fixed to
 
     @classmethod
     def at(cls, point: np.ndarray, pos: np.ndarray, orientation: Rotation) -> GraspPoint:
-        """Return a point (3,) m as fixed to a body at pos (3,) m with an orientation."""
+        """Return a point (3,) m fixed to a body at pos (3,) m with the given orientation."""
         return cls(orientation.inv().apply(point - pos))
 
     def of(self, pos: np.ndarray, orientation: Rotation) -> np.ndarray:
-        """Return where the point is for bodies at pos (N, 3) m with N orientations, (N, 3) m."""
+        """Return the point's positions (N, 3) m for N body positions (N, 3) m and orientations."""
         return pos + orientation.apply(self.offset)
 
 
 def base_orientation(joints: np.ndarray) -> Rotation:
-    """Return orientations in the mount's frame at base joint positions (6,), (N, 6) or a qpos."""
+    """Return the mount body's orientations in the mount's frame.
+
+    Args:
+        joints: base joint positions (6,) or (N, 6), or a whole qpos.
+    """
     return Rotation.from_euler("XYZ", joints[..., SLIDES:BASE_JOINTS])
 
 
 def carried_path(index: SceneIndex, reference: ObjectReference, start: Tensor) -> Tensor:
     """Return base joint positions (T, 6), m and rad, that move the hand rigidly with the motion.
 
-    With D_k = R(x_k) R(x_0)^-1 the mount body goes to x_k + D_k (p_0 - x_0) and is rotated
-    to D_k R_0. Joint positions may be beyond the limits of the base.
+    The mount body, which starts at position p_0 with rotation R_0, goes to x_k + D_k (p_0 - x_0)
+    with rotation D_k R_0, where D_k = R(x_k) R(x_0)^-1 is the object's rotation since the first
+    pose. The result may exceed the base's joint limits.
 
     Args:
         index: index of the scene.
@@ -64,7 +69,7 @@ def carried_path(index: SceneIndex, reference: ObjectReference, start: Tensor) -
     to_mount = rotations.conjugate(mount_quat)
     in_mount = rotations.multiply(to_mount, rotations.multiply(moved, r0))
     angles = rotations.unwrap(rotations.to_euler_xyz(in_mount))
-    # Begin on the branch of the start itself, which may be beyond +-pi.
+    # Shift by full turns so that the first angles match the start's, which may be beyond +-pi.
     angles = angles + 2 * torch.pi * torch.round((hinges - angles[0]) / (2 * torch.pi))
     return torch.cat((rotations.rotate(to_mount, pos - mount_pos), angles), -1)
 
@@ -76,18 +81,17 @@ def clipped_path(index: SceneIndex, reference: ObjectReference, start: Tensor) -
 
 
 def feasible_path(index: SceneIndex, reference: ObjectReference, start: Tensor) -> Tensor:
-    """Return base joint positions (T, 6) that keep the grasp point on the motion.
+    """Return base joint positions (T, 6) within the control ranges, with the grasp point on target.
 
-    They are within the control ranges.
-
-    With x the target in the mount's frame, o the grasp point in the hand's, a the three hinge
-    angles and R(a) their rotation, the slides follow from the hinges: s(a) = x - R(a) o. Each step
-    is a bounded least-squares problem in a,
+    With x the target in the mount's frame, o the grasp point in the mount body's frame, a the three
+    hinge angles and R(a) their rotation, the slides follow from the hinges: s(a) = x - R(a) o. Each
+    step is a bounded least-squares problem in a,
 
         min  |s - clip(s)|^2 + |TURN_M log(R_carried^-1 R(a))|^2 + |0.003 (a - a_before)|^2
 
-    in m and rad: position first, then the carried orientation, then little change from step to
-    step. It is solved from the step before and from the carried hinges; the better result is kept.
+    in m and rad: position has priority over the carried orientation, and that over a small change
+    since the previous step. The solver starts once from the previous step's hinges and once from
+    the carried path's; the better result is kept.
 
     Args:
         index: index of the scene.
@@ -132,4 +136,4 @@ def _rotation(hinges: np.ndarray) -> Rotation:
 
 
 PATHS = {"carried": carried_path, "clipped": clipped_path, "feasible": feasible_path}
-"""Path by its name in ``action.wrist_path``."""
+"""Functions that compute a path, by the path's name in ``action.wrist_path``."""

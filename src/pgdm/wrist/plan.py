@@ -1,4 +1,4 @@
-"""Wrist plans: commands of the base with which the hand alone follows an exemplar motion."""
+"""Wrist plans: commands of the base with which the hand alone follows a motion."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from pgdm.wrist.search import REAL_STAGE, SMOOTH_STAGE, Search
 __all__ = ["WristPlan", "WristProblem", "plan_wrist", "simulate"]
 
 NEAR_M = 0.01
-"""Error within which a step counts as followed, as in the benchmark's success."""
+"""A step counts towards the rigid grasp if its error is below this, the threshold of success."""
 
 
 @dataclass(frozen=True)
 class WristPlan:
-    """Commands, and what the hand alone does with them."""
+    """Base commands, and the simulated motion of the hand alone under them."""
 
     commands: np.ndarray
     """Targets of the base joints at control steps 0..T-2, (T-1, 6) m, rad."""
     qpos: np.ndarray
-    """The scene at steps 0..T-1, (T, nq); objects stay where they are at the start."""
+    """The scene's positions at steps 0..T-1, (T, nq); objects as in the start state."""
     error_m: np.ndarray
     """Distance of the grasp point from its target after each step, (T-1,) m."""
     frames: int = 0
     """Control steps simulated by the search."""
     seconds: float = 0.0
-    """Time of the search, s."""
+    """Duration of the search, s."""
 
     def sha256(self) -> str:
         """Return a hash of the commands."""
         return hashlib.sha256(self.commands.tobytes()).hexdigest()
 
     def described(self) -> str:
-        """Return in a sentence how closely the hand alone follows."""
+        """Return a sentence on how closely the hand alone follows the motion."""
         return (
             f"the hand alone is {1e3 * self.error_m.mean():.1f} mm off the motion on average, "
             f"{1e3 * self.error_m.max():.0f} mm at most, within 1 cm in {self.rigid_grasp:.0%} of "
@@ -49,10 +49,10 @@ class WristPlan:
 
     @property
     def rigid_grasp(self) -> float:
-        """Share of the steps with the grasp point within 1 cm (0..1): *rigid grasp* in reports.
+        """Share of the steps with the grasp point within 1 cm of its target (0..1).
 
-        The success that a grasp which never slips would reach with these commands; a policy may
-        exceed it, since it corrects them.
+        This is the success of a grasp that never slips under these commands, *rigid grasp* in
+        reports. A policy may exceed it, since it corrects the commands.
         """
         return float((self.error_m < NEAR_M).mean())
 
@@ -66,10 +66,10 @@ def plan_wrist(
         problem: motion, start state and hand.
         num_threads: number of threads of the simulations; 0 takes one per core. The plan does not
             depend on it.
-        progress: called with the rounds of the search.
+        progress: called before each round of the search.
 
     Raises:
-        ConfigError: if the motion is too short for the hold, or too long to plan.
+        ConfigError: if the motion is too short for ``hold_steps``, or too long to plan.
         SceneError: if the simulation of the hand diverges.
     """
     problem.check()
@@ -82,9 +82,9 @@ def plan_wrist(
 
 
 def simulate(problem: WristProblem, commands: np.ndarray) -> WristPlan:
-    """Return what the hand alone does with commands (T-1, 6)."""
+    """Simulate the hand alone with commands (T-1, 6), and return them as a plan."""
     rollout = HandAlone(problem, hand_alone(problem.scene)).rollout(commands)
     errors = np.linalg.norm(rollout.points - problem.reference.pos.numpy()[1:], axis=1)
     qpos, fingers_end = rollout.qpos.copy(), problem.scene.index.num_joints
-    qpos[:, fingers_end:] = problem.qpos[fingers_end:]  # the objects fell: nothing holds them
+    qpos[:, fingers_end:] = problem.qpos[fingers_end:]  # unsupported objects fell
     return WristPlan(commands, qpos, errors)

@@ -1,4 +1,4 @@
-"""What a wrist plan is computed for, and the hash of everything it depends on."""
+"""The input of a wrist plan, and the hash of everything that the plan depends on."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from pgdm.motion.reference import ObjectReference
 from pgdm.sim.scene import Scene
 
 VERSION = 1
-"""Version of the planner; plans in the library that another version stored are computed anew."""
+"""Version of the planner; the library's plans from another version are recomputed."""
 
-_LIFTED_M = 0.02
-_LONGEST = 250  # poses: the quadratic program's time grows with the third power
-_OF_FILES = re.compile("path|nbuffer").search  # fields that depend on where files are
+_LIFTED_M = 0.02  # rise of the motion at which the hand bears the full weight
+_LONGEST = 250  # poses; the solver's time grows with the cube of their number
+_OF_FILES = re.compile("path|nbuffer").search  # model fields that depend on file paths
 
 
 @dataclass(frozen=True)
@@ -31,21 +31,21 @@ class WristProblem:
     reference: ObjectReference
     qpos: np.ndarray  # (nq,) m, rad: the start state
     qvel: np.ndarray  # (nv,) m/s, rad/s
-    fingers: np.ndarray  # (nu,) m, rad: targets at which all driven joints but the base's are held
+    fingers: np.ndarray  # (nu,) m, rad: constant actuator targets; the base's entries are unused
     substeps: int
     """Physics steps per control step."""
     hold_steps: int = 0
-    """Control steps for which the hand stays at its start, so that the fingers can close. It then
-    has as many to catch up, in which errors cost nothing."""
+    """Control steps for which the hand waits at its start while the fingers close. In as many steps
+    after that, errors cost nothing, so that the hand can catch up."""
     bears_load: bool = False
-    """Whether the hand bears the object's weight from when the motion lifts it: gravity
-    compensation covers the hand only."""
+    """Whether the hand carries the object's weight once the motion lifts the object. Gravity
+    compensation does not cover that weight, only the hand's."""
 
     def check(self) -> None:
-        """Check that the hold leaves time to follow, and that the motion is not too long.
+        """Check that the motion is longer than hold and catch-up, and not too long to plan.
 
         Raises:
-            ConfigError: if not.
+            ConfigError: the motion is too short or too long.
         """
         poses = len(self.reference)
         if 2 * self.hold_steps >= poses - 1:
@@ -60,25 +60,28 @@ class WristProblem:
             )
 
     def target_steps(self) -> np.ndarray:
-        """Return the step of the motion at which the hand is to be, (T,): 0 during the hold."""
+        """Return the step of the motion that the hand should follow, (T,): 0 during the hold."""
         step = np.arange(len(self.reference))
         return np.where(step <= self.hold_steps, 0, step)
 
     def load_n(self) -> np.ndarray:
-        """Return the weight borne at each step, (T,) N: m g clip((z_k - z_0) / 2 cm, 0, 1)."""
+        """Return the load at each step, (T,) N: m g clip((z_k - z_0) / 2 cm, 0, 1).
+
+        It is zero without ``bears_load``, and for an object that is attached to something.
+        """
         scene, height = self.scene, self.reference.pos.numpy()[self.target_steps(), 2]
         if not (self.bears_load and scene.lies_free):
             return np.zeros(len(height))
-        # The tracked body may be a part of the object.
+        # The tracked body may be only one part of the object: take the mass of all parts.
         root = scene.model.body_rootid[scene.index.object_body]
         weight = scene.model.body_subtreemass[root] * -scene.model.opt.gravity[2]
         return weight * ((height - height[0]) / _LIFTED_M).clip(0.0, 1.0)
 
     def key(self) -> str:
-        """Return a SHA-256 over all that a plan depends on, the whole compiled model included."""
+        """Return a SHA-256 over all that a plan depends on, including the compiled model."""
         return self._key
 
-    @cached_property  # the model may have tens of megabytes
+    @cached_property  # hashing is slow: the model may have tens of megabytes
     def _key(self) -> str:
         scene = self.scene
         numbers = (
@@ -96,7 +99,7 @@ class WristProblem:
 
 
 def _content(struct: Any) -> bytes:
-    """Return all numbers of one of MuJoCo's structures, except those that depend on file paths."""
+    """Return the numbers of a MuJoCo structure as bytes, except those that depend on file paths."""
     names = (name for name in sorted(dir(struct)) if name[0] != "_" and not _OF_FILES(name))
     values = ((name, getattr(struct, name)) for name in names)
     return b"".join(

@@ -1,4 +1,4 @@
-"""The wrist search's cost around its commands, as a quadratic program with one-sided limits."""
+"""Local model of the wrist search's cost: a quadratic, plus one-sided costs at joint limits."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from qpsolvers import solve_qp
 from pgdm.wrist.path import BASE_JOINTS
 
 PER_LIMIT = np.repeat((300.0, 90.0), 3)
-"""Residual of a slide, 1/m, and a hinge, 1/rad, beyond its limits: 1 at 3 mm or 0.01 rad."""
-_TINY, _SAME = 1e-9, 1e-6
+"""Residual per excess over a joint limit, 1/m for slides, 1/rad for hinges: 1 at 3 mm, 0.01 rad."""
+_TINY, _SAME = 1e-9, 1e-6  # _SAME: m and rad, changes closer than this are equal
 _LIMIT_ROUNDS = 6
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Ranges that joint positions are to stay in."""
+    """Ranges that the base's joint positions should stay in."""
 
     low: np.ndarray  # (6,) m, rad
-    high: np.ndarray
+    high: np.ndarray  # (6,) m, rad
 
     def nearest(self, joints: np.ndarray) -> np.ndarray:
         """Return joint positions (K, 6) clipped to the ranges."""
         return joints.clip(self.low, self.high)
 
     def beyond(self, joints: np.ndarray) -> np.ndarray:
-        """Return residuals (K, 6), L (q - clip(q)), of joint positions q (K, 6)."""
+        """Return the residuals L (q - clip(q)), (K, 6), of joint positions q, (K, 6)."""
         return PER_LIMIT * (joints - self.nearest(joints))
 
 
 class Model:
-    """The cost of a change d of the commands, with J, r, B and q its arguments and L ``PER_LIMIT``.
+    """The cost of a change d (K * 6,) of the commands, where L is ``PER_LIMIT``:
 
         |r + J d|^2 + |L (q + B d - clip(q + B d))|^2
 
@@ -41,7 +41,7 @@ class Model:
         residuals: residuals at the commands, r (R,).
         joints_by: Jacobian of the joint positions by the commands, B (K * 6, K * 6).
         joints: joint positions at the commands, q (K, 6) m, rad.
-        limits: ranges that joints are to stay in.
+        limits: ranges that the joints should stay in.
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class Model:
         self._weights = np.tile(PER_LIMIT, len(joints))
 
     def least(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the change of least cost within bounds, all (K, 6).
+        """Return the change of the commands with the least cost between bounds, all (K, 6).
 
-        Each round solves min 1/2 d'Hd + g'd, low <= d <= high, in which the limit term counts for
-        the joints that the last round's change takes beyond a limit: up to six rounds until the
-        change stays the same. Returns the best one.
+        Each round solves min 1/2 d'Hd + g'd with low <= d <= high. The limit term is included only
+        for joints that the previous round's change takes beyond a limit. Rounds end when the change
+        stays the same, or after six; the change of least cost is returned.
         """
         low, high = low.ravel(), np.maximum(high, low + _TINY).ravel()
         best = step = np.zeros_like(low)
@@ -81,7 +81,7 @@ class Model:
         return best.reshape(-1, BASE_JOINTS)
 
     def gain(self, step: np.ndarray) -> float:
-        """Return the predicted decrease of the cost for a change (K * 6,)."""
+        """Return the decrease of the cost that the model predicts for a change (K * 6,)."""
         smooth = self._gradient @ step + 0.5 * step @ self._hessian @ step
         before, after = (
             (self._limits.beyond(joints) ** 2).sum() for joints in (self._joints, self._after(step))

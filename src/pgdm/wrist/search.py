@@ -1,25 +1,26 @@
-r"""Gauss-Newton on the commands of all control steps at once, with derivatives by simulation.
+r"""Gauss-Newton on the commands of all control steps at once, with finite-difference derivatives.
 
-The base's servos are soft and underdamped: a path sent to them unmodified is tracked late and
+The base's servos are soft and underdamped: if a path is sent to them unmodified, the hand lags and
 overshoots by centimetres. The search therefore minimises over all commands together. Let u_k be the
-targets of the six base joints at step k = 0..K-1, q_k the base joint positions after it, g_k the
-grasp point (the object's centre of mass at the start, fixed in the palm), R_k the palm's
-orientation, x_k and R*_k the targets of these two, and p the feasible path. The cost is
+targets of the six base joints at step k = 0..K-1, and q_k the base joint positions after that step.
+Let g_k be the grasp point (a point fixed to the palm, where the object's centre of mass is at the
+start) and R_k the palm's orientation, with targets x_k and R*_k, and p the feasible path of
+`pgdm.wrist.path`. The cost is
 
     sum_k  w_k |100 (g_k - x_k)|^2  +  w_k |0.9 log(R*_k^-1 R_k)|^2      follow the motion
            + |C (u_k - u_{k-1})|^2  +  |0.2 C (u_k - p_k)|^2             smooth, near the path
            + |L (q_k - clip(q_k))|^2                                     keep off the joint limits
 
 in m and rad, with w_k = 0 while the hand catches up after a hold (see `WristProblem.hold_steps`),
-else 1; C = diag(2, 2, 2, 0.6, 0.6, 0.6), L = diag(300, 300, 300, 90, 90, 90), and ``clip`` to the
-joint ranges less a margin.
+else 1; C = diag(2, 2, 2, 0.6, 0.6, 0.6), L = diag(300, 300, 300, 90, 90, 90). ``clip`` limits to
+the joint ranges less a margin.
 
-Let s be positions and velocities of the n joints coupled to the base, s_{k+1} = f(s_k, u_k) one
-control step, F = df/ds and G = df/du by one-sided finite differences. Chained,
+Let s be the positions and velocities of the base and wrist joints, s_{k+1} = f(s_k, u_k) one
+control step, F = df/ds and G = df/du by one-sided finite differences. The chain rule gives
 
     S_0 = 0,   S_{k+1} = F_k S_k + G_k E_k,   S = ds/du,   E_k u = u_k
 
-This gives the residuals' Jacobian; `quadratic.Model` then computes the step d subject to
+and with it the residuals' Jacobian; `quadratic.Model` then computes the step d subject to
 max(low - u, -trust) <= d <= min(high - u, trust). The trust region grows and shrinks with the ratio
 of actual to predicted decrease.
 """
@@ -43,17 +44,17 @@ from pgdm.wrist.path import BASE_JOINTS, SLIDES, base_orientation, feasible_path
 from pgdm.wrist.problem import WristProblem
 from pgdm.wrist.quadratic import Limits, Model
 
-# These cost the same: a grasp point 1 cm off, a palm rotated by 1.1 rad, a joint 3 mm or 0.01 rad
-# inside its margin (`quadratic.PER_LIMIT`).
+# These cost the same: the grasp point 1 cm off target, the palm 1.1 rad off target, or a joint 3 mm
+# or 0.01 rad inside its margin (`quadratic.PER_LIMIT`).
 _PER_M, _PER_RAD = 100.0, 0.9
-_MARGIN = np.repeat((0.005, 0.03), SLIDES)  # m and rad that joints keep from their limits
+_MARGIN = np.repeat((0.005, 0.03), SLIDES)  # m and rad: distance of joints from their limits
 _CHANGE, _NEAR_PATH = np.repeat((2.0, 0.6), SLIDES), 0.2
 _STEP, _STEP_PER_S = 1e-4, 1e-3  # of finite differences: m and rad, m/s and rad/s
-# Ratio of actual to predicted decrease: below the first the trust region shrinks, above the second
+# Ratios of actual to predicted decrease: below the first the trust region shrinks, above the second
 # it grows.
 _POOR_RATIO, _GOOD_RATIO = 0.3, 0.75
-_ENOUGH = 0.01  # a stage ends with a step that lowers the cost by less than this fraction of it
-_LEAST_TRUST = 1e-3  # a stage also ends with a trust region below this, m and rad
+_ENOUGH = 0.01  # a stage ends once a step lowers the cost by less than this share
+_LEAST_TRUST = 1e-3  # a stage also ends once the trust region is below this, m and rad
 _TINY = 1e-9
 _FROZEN = 1e3  # armature that keeps a finger where it is, kg m^2
 _SMOOTH = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
@@ -70,12 +71,12 @@ class Stage:
 
 
 SMOOTH_STAGE, REAL_STAGE = Stage(15, 0.3), Stage(8, 0.03)
-"""The first stage is without limits and contacts, whose discontinuities mislead the search; the
-second is with them."""
+"""The first stage simulates without joint limits and contacts, because their discontinuities
+mislead the search; the second simulates with them."""
 
 
 class Search:
-    """The search for one problem.
+    """Search for the wrist plan of one problem.
 
     Args:
         problem: motion, start state and hand.
@@ -99,12 +100,12 @@ class Search:
             ctrl_high=np.minimum(self._high, self._limits.high),
         )
         self.path = feasible_path(within, problem.reference, torch.from_numpy(problem.qpos)).numpy()
-        # Number of joints dynamically coupled to the base: its own, and those that rotate the palm.
+        # Number of base and wrist joints: those that move the palm.
         self._n = scene.hand.num_base_joints + scene.hand.num_wrist_joints
         alone = hand_alone(scene)
         model = copy.deepcopy(alone.model)
         model.opt.disableflags |= _SMOOTH
-        # Without limits the fingers would swing past them, so they are frozen.
+        # Without joint limits the fingers would swing past them, so a large armature freezes them.
         model.dof_armature[self._n : index.num_joints] = _FROZEN
         smooth = replace(alone, model=model)
         self._real_hand, self._smooth_hand = (HandAlone(problem, s) for s in (alone, smooth))
@@ -118,12 +119,12 @@ class Search:
         self._followed = ((step <= hold) | (step > 2 * hold))[1:, None]
 
     def improve(self, commands: np.ndarray, stage: Stage, real: bool) -> np.ndarray:
-        """Return better commands.
+        """Return commands (K, 6) of lower cost, or the same if no step lowers it.
 
         Args:
             commands: commands to start from, (K, 6) m and rad.
             stage: number and size of the steps.
-            real: whether joint limits and contacts are enabled.
+            real: whether joint limits and contacts are simulated.
         """
         hand, trust = self._real_hand if real else self._smooth_hand, stage.trust
         commands = commands.clip(self._low, self._high)
@@ -167,13 +168,13 @@ class Search:
         return sum(float((part**2).sum()) for part in parts)
 
     def _tracking_residuals(self, points: np.ndarray, orientations: Rotation) -> np.ndarray:
-        """Return residuals (K, 6): of the grasp point's position, then the palm's orientation."""
+        """Return residuals (K, 6): the grasp point's position, then the palm's orientation."""
         angles = (self._palms.inv() * orientations).as_rotvec()
         errors = np.concatenate((_PER_M * (points - self._targets), _PER_RAD * angles), 1)
         return errors * self._followed
 
     def _residuals(self, commands: np.ndarray, rollout: Rollout) -> tuple[np.ndarray, ...]:
-        """Return residuals (K, 6) each: tracking, change of commands, distance to the path."""
+        """Return three residuals (K, 6): tracking, change of commands, distance to the path."""
         tracking = self._tracking_residuals(rollout.points, rollout.orientations)
         change = np.diff(np.concatenate((self.path[:1], commands)), axis=0)
         return tracking, _CHANGE * change, _NEAR_PATH * _CHANGE * (commands - self.path[1:])
@@ -181,8 +182,8 @@ class Search:
     def _linearise(self, commands: np.ndarray, rollout: Rollout) -> Model:
         """Return the Gauss-Newton model of the cost at ``commands``.
 
-        Both stages use the derivatives of the smooth hand: with contacts and limits, the
-        derivatives are valid only over very small changes.
+        Both stages use derivatives simulated without contacts and limits: with them, derivatives
+        are valid only over very small changes.
         """
         steps, size, n = len(commands), commands.size, 2 * self._n
         tracking_by, joints_by = np.zeros((2, steps, BASE_JOINTS, size))
@@ -203,10 +204,10 @@ class Search:
         )
 
     def _step_jacobians(self, commands: np.ndarray, rollout: Rollout) -> np.ndarray:
-        """Return Jacobians of the steps (K, 2n + 6, 2n + 6), all steps simulated side by side.
+        """Return the Jacobians of all steps (K, 2n + 6, 2n + 6), simulated in parallel.
 
-        Rows: positions and velocities of n joints after the step, then the tracking residuals;
-        columns: positions and velocities before the step, then commands.
+        Rows: positions and velocities of the n base and wrist joints after the step, then the
+        tracking residuals; columns: positions and velocities before the step, then the commands.
         """
         steps, n = len(commands), self._n
         ctrl = np.repeat(self._problem.fingers[None], steps, 0)
@@ -216,14 +217,14 @@ class Search:
         def after() -> np.ndarray:
             self.frames += steps
             self._steps.reset(np.arange(steps), qpos, qvel)
-            # `_steps` is the smooth scene; the hand only applies load and commands here.
+            # `_steps` simulates the smooth scene; `_real_hand` only applies load and commands.
             self._real_hand.step(self._steps, ctrl, np.arange(1, steps + 1))
             state = self._steps.read()
             tracking = self._tracking_residuals(*self._real_hand.grasp_point(self._steps))
             return np.concatenate((state.qpos[:, :n], state.qvel[:, :n], tracking), 1)
 
         here, columns = after(), []
-        # Away from the upper end of the control range: beyond it a command changes nothing.
+        # Step downwards at the upper end of the control range: beyond it a command has no effect.
         inward = np.where(commands + _STEP > self._high, -_STEP, _STEP)
         for array, by in (
             (qpos, np.full((steps, n), _STEP)),

@@ -1,4 +1,4 @@
-"""Stored wrist plans: the first run that needs one computes it."""
+"""Stored wrist plans: the first run that needs a plan computes and stores it."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from pgdm.library.progress import Notify, StepProgress
 from pgdm.wrist.plan import WristPlan, WristProblem, plan_wrist
 
 FILE = "wrist.npz"
-"""A run's own copy: a policy needs the commands that it was trained on."""
+"""Name of the copy in a run folder: a policy needs the commands that it was trained on."""
 _FOLDER = "wrist"
 
 
 def path_of(library: Path, problem: WristProblem) -> Path:
-    """Return where a library folder stores the plan of a problem; it may not exist."""
+    """Return the path of a problem's plan in a library folder; the file may not exist."""
     name = f"{problem.scene.task.id}-{problem.scene.hand.name}-{problem.key()[:16]}"
     return paths.inside(library / _FOLDER, name, suffix=".npz")
 
 
 class WristPlans:
-    """Gives the plan of a problem: a run's own copy, else the library's, else a new one.
+    """Provides wrist plans: a run's own copy, else the library's, else a newly computed plan.
 
     Args:
-        library: its folder.
-        run: folder of a run; None for none.
-        notify: called with a sentence on what is computed, missing or damaged.
-        progress: called with the planner's progress; None: missing plans are not computed.
+        library: the library's folder.
+        run: the run's folder; None without a run.
+        notify: called with a sentence when a plan is computed, missing or damaged.
+        progress: called with the planner's progress; with None, missing plans are not computed.
         num_threads: number of threads of the planner; 0 takes one per core.
     """
 
@@ -49,14 +49,15 @@ class WristPlans:
         self._progress, self._threads = progress, num_threads
 
     def __call__(self, problem: WristProblem) -> WristPlan | None:
-        """Return a problem's plan; None if it is missing and must not be computed.
+        """Return a problem's plan; None if it is missing and ``progress`` is None.
 
         Raises:
-            ConfigError: the motion is too short for the hold, or too long to plan.
+            ConfigError: the motion is too short for ``hold_steps``, or too long to plan.
+            SceneError: the simulation of the hand diverges.
         """
         problem.check()
         stored, own = path_of(self._library, problem), None
-        if self._run is not None:  # valid whatever the version of planner or MuJoCo is by now
+        if self._run is not None:  # valid even if planner or MuJoCo have changed since
             own = self._found(self._run / FILE, problem, any_version=True)
         if (plan := own or self._found(stored, problem)) is not None:
             return plan
@@ -68,11 +69,11 @@ class WristPlans:
             return None
         try:
             with staging.making(stored, self._notify):
-                with suppress(CorruptAssetError):  # another process was first
+                with suppress(CorruptAssetError):  # another process may have computed it meanwhile
                     return read(stored, problem)
                 plan = self._plan(problem, self._progress)
                 write(stored, plan, problem)
-        except LibraryError as error:  # a library that belongs to another user
+        except LibraryError as error:  # such as a library that belongs to another user
             self._notify(f"{error}; the wrist plan of '{task}' is stored with the run only")
             plan = plan or self._plan(problem, self._progress)
         return plan
@@ -117,11 +118,11 @@ def read(path: Path, problem: WristProblem, any_version: bool = False) -> WristP
 
     Args:
         path: path of the file.
-        problem: that it solves.
-        any_version: whether a plan that only shares the problem's start state is accepted.
+        problem: the problem that the plan is for.
+        any_version: accept a plan for the same start state even if the problem's hash differs.
 
     Raises:
-        CorruptAssetError: the file is missing, damaged, or of another problem.
+        CorruptAssetError: the file is missing, damaged, or for another problem.
     """
     arrays = safe_npz.read_npz(path)
     steps, nq = len(problem.reference) - 1, problem.scene.model.nq
@@ -140,7 +141,7 @@ def read(path: Path, problem: WristProblem, any_version: bool = False) -> WristP
 
 
 def _is_finite(array: object, shape: tuple[int, ...]) -> bool:
-    # One type only: the hash of the commands is over their bytes.
+    # No other number type: `WristPlan.sha256` hashes the commands' bytes.
     if not (isinstance(array, np.ndarray) and array.dtype == np.float64):
         return False
     return array.shape == shape and bool(np.isfinite(array).all())

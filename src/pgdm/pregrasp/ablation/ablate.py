@@ -19,21 +19,22 @@ FINGERS = ("keep", "open", "mean")
 OBJECT_TOLERANCE_M = 0.005
 """How far the fingers may displace the object while they move to their pose."""
 OVERLAP_M = 0.0015
-"""Largest penetration of an ablated start, by any finger or the rest of the hand, and none that is
-deeper than that part's in the stored start. It is above 0 because contacts are soft: a hand at rest
-on an object sinks in a little."""
+"""Largest penetration allowed in an ablated start. Each finger, and the rest of the hand, may
+penetrate by at most this, and no deeper than in the stored start. Not zero, because contacts are
+soft: a hand at rest on an object sinks in a little."""
 REACH_TOLERANCE_RAD = 0.2
-"""How near the fingers must come to their pose in the simulation: Adroit's weak servos lag by
+"""Largest error of a finger joint at the end of the simulated motion: Adroit's weak servos lag by
 0.1 rad where tendons couple two joints."""
 RETREAT_STEP_M, SLOW_STEP_M = 0.001, 0.005
-"""Steps of the hand's retreat: with the fingers as wanted, and with fingers that stop early."""
+"""Step sizes of the search over retreats: with fingers in the requested pose, and with fingers that
+stop early."""
 FINGER_LENGTH_M = 0.1
-"""Converts a finger's error to one of its tip, to weigh it against a retreat of the hand."""
-_SHORT_M = 0.001  # shortfall of the distance that is reported
-_FINGER_FRACTIONS = np.linspace(0.0, 1.0, 51)  # of the motion to the pose: where do fingers stop?
+"""Converts a joint error to a fingertip error, to compare it with a retreat of the hand."""
+_SHORT_M = 0.001  # a distance is reported as too short if it falls short by more
+_FINGER_FRACTIONS = np.linspace(0.0, 1.0, 51)  # of the way to the pose, where fingers may stop
 _RETREAT_STEPS, _FINGER_STEPS, _HOLD_STEPS = 8, 25, 10  # control steps of 0.04 s
 _EXACT_M = 1e-9
-_TRIALS = 3  # poses tried in the simulation
+_TRIALS = 3  # most poses that are tried in the simulation
 
 
 @dataclass(frozen=True)
@@ -50,11 +51,11 @@ class AblationCfg:
 
     @property
     def changes_start(self) -> bool:
-        """Whether episodes start elsewhere than without it."""
+        """Whether the ablation changes the start state."""
         return self.fingers != "keep" or self.distance_m > 0
 
     def check(self, source: str) -> None:
-        """Check that it applies to starts of a pre-grasp source, ``pregrasp.source``.
+        """Check that the ablation can be applied to a pre-grasp source, ``pregrasp.source``.
 
         Raises:
             ConfigError: a value is wrong, or there is no pre-grasp to ablate.
@@ -64,37 +65,37 @@ class AblationCfg:
         if (self.name == "none") == self.changes_start:
             raise ConfigError(
                 f"ablation.name is '{self.name}' with ablation.fingers '{self.fingers}' and "
-                f"ablation.distance_m {self.distance_m}; the name 'none' is for fingers=keep with "
-                "distance_m=0, and only for that"
+                f"ablation.distance_m {self.distance_m}; use the name 'none' if fingers=keep and "
+                "distance_m=0, and another name otherwise"
             )
         if source == "none" and self.changes_start:
             raise ConfigError(
                 f"ablation={self.name} changes the pre-grasp, but pregrasp=none starts without "
-                "one: nothing is left to ablate; use ablation=none, or another pregrasp"
+                "a pre-grasp: nothing is left to ablate; use ablation=none, or another pregrasp"
             )
 
 
 @dataclass(frozen=True)
 class Ablated:
-    """An ablated start, and how far it deviates from the wanted one."""
+    """An ablated start, and how far it deviates from the requested ablation."""
 
     start: StartState
     distance_m: float
     """Distance of the mount body from its position in the pre-grasp."""
     retreat_m: float
-    """Further retreat, which the hand needed to be free."""
+    """Further retreat that the hand needed to be free of penetration."""
     finger_error_rad: float
     """Largest error of a finger joint."""
     object_moved_m: float
-    """How far the fingers pushed the object in the simulation; it was put back."""
+    """How far the fingers pushed the object in simulation; in the start it is back in place."""
     simulated: bool
-    """Whether the fingers were moved there in the simulation, or set kinematically."""
+    """Whether the fingers can move there in simulation; else the pose is only set kinematically."""
     depth_m: float
-    """Deepest penetration of the hand and anything else."""
+    """Deepest penetration between the hand and anything else."""
 
     @property
     def deviation_m(self) -> float:
-        """Retreat of the hand, and the fingers' error at their tips."""
+        """Retreat of the hand plus the finger error, converted to an error of the tip."""
         return self.retreat_m + FINGER_LENGTH_M * self.finger_error_rad
 
     def facts(self) -> dict[str, str]:
@@ -108,10 +109,10 @@ class Ablated:
         }
 
     def compromises(self, asked_m: float) -> str:
-        """Return in words how it deviates from the wanted start; empty if it does not.
+        """Return in words how the start deviates from the requested ablation; empty if it does not.
 
         Args:
-            asked_m: the distance of the ablation.
+            asked_m: the requested distance, ``ablation.distance_m``.
         """
         parts = []
         if self.retreat_m > 0:
@@ -127,25 +128,27 @@ class Ablated:
 
 
 def ablate(cfg: AblationCfg, start: StartState, scene: Scene, substeps: int) -> Ablated:
-    """Return the start state without what the ablation removes from its pre-grasp.
+    """Return the start state after the ablation.
 
-    The hand keeps its orientation and the object its pose and velocity; the hand is at rest. The
-    hand moves by the distance along the straight line to its reset position, and beyond it if that
-    is nearer, up to the limit of a slide. If the hand then penetrates something, deeper than the
-    stored start or :data:`OVERLAP_M`, one of two compromises is made, whichever deviates less: the
+    The hand is at rest and keeps its orientation; the object keeps its pose and velocity. The hand
+    moves by ``cfg.distance_m`` along the straight line towards its reset position, if need be past
+    it, up to the limit of a slide. If the hand then penetrates something, deeper than in the stored
+    start or than :data:`OVERLAP_M`, one of two compromises is made, whichever deviates less: the
     hand retreats further, back, up or away from the object; or each finger stops at the first
-    contact on its motion from the pre-grasp. That motion is then checked in the simulation, where
-    it must not push the object. Equal arguments give an equal result.
+    contact on its way from the pre-grasp. This motion is then checked in simulation, where it must
+    not push the object (unless the stored start already penetrates deeply). Equal arguments give an
+    equal result.
 
     Args:
-        cfg: what to remove.
-        start: the stored start, with its pre-grasp.
+        cfg: the ablation.
+        start: the stored start state.
         scene: scene of the task.
         substeps: physics steps per control step.
 
     Raises:
-        ConfigError: the start is the reset pose, or the hand's mean has another length.
-        SceneError: no free pose exists within the slides' limits.
+        ConfigError: a setting is wrong, the start is the reset pose, or ``hand.mean_fingers_rad``
+            has a wrong length.
+        SceneError: no pose free of penetration exists within the slides' limits.
     """
     cfg.check(start.source)
     if cfg.changes_start and is_reset_pose(scene, start.qpos):
@@ -173,10 +176,10 @@ class _Ablation:
     def __init__(self, cfg: AblationCfg, start: StartState, scene: Scene) -> None:
         self._cfg, self._start, self._scene = cfg, start, scene
         self._contact = HandContact(scene)
-        depths = self._contact.depths(start.qpos)  # m, of each finger and the rest
+        depths = self._contact.depths(start.qpos)  # m, of each finger and the rest of the hand
         self._allowed = np.minimum(depths, OVERLAP_M)
         self.starts_inside = float(depths.max()) > OBJECT_TOLERANCE_M
-        """Whether the start penetrates so deep that a simulation would push the object away."""
+        """Whether the start penetrates so deeply that a simulation would push the object away."""
         self._fingers = slice(self._contact.first_finger_joint, scene.index.num_joints)
         self._goal = self._finger_goal()  # (J,) rad
         slides = start.qpos[:3]
@@ -189,7 +192,7 @@ class _Ablation:
     def found(
         self, qpos: np.ndarray, retreat: float, pushed: float = 0.0, simulated: bool = False
     ) -> Ablated:
-        """Return a pose as a result: the hand is at rest, the objects move as before."""
+        """Return the result for a pose: hand at rest, objects with their stored velocities."""
         start, n = self._start, self._scene.index.num_joints
         if self._cfg.changes_start:
             qvel = start.qvel.copy()
@@ -201,7 +204,7 @@ class _Ablation:
         return Ablated(start, distance, retreat, error, pushed, simulated, depth)
 
     def set_free(self) -> Ablated:
-        """Return the wanted pose, at the least retreat at which it penetrates nothing."""
+        """Return the requested pose with the smallest retreat that frees it from penetration."""
         rooms = [self._room(self._slides, direction) for direction in self._retreats]
         for retreat in np.arange(0.0, max(rooms) + RETREAT_STEP_M, RETREAT_STEP_M):
             for direction, room in zip(self._retreats, rooms, strict=True):
@@ -214,7 +217,7 @@ class _Ablation:
         )
 
     def stopped(self, limit: float) -> list[Ablated]:
-        """Return free poses whose fingers stop early and deviate less than a limit, best first."""
+        """Return free poses with fingers that stop early, deviation below a limit, best first."""
         poses: list[Ablated] = []
         for retreat in np.arange(0.0, limit, SLOW_STEP_M):
             for direction in self._retreats if retreat > 0 else self._retreats[:1]:
@@ -230,10 +233,10 @@ class _Ablation:
         return poses
 
     def moved(self, sim: SimBatch, pose: Ablated) -> Ablated | None:
-        """Return a pose if the simulation gets there without pushing the object, else None.
+        """Return a pose if the hand gets there in simulation without pushing the object, else None.
 
-        A stored object may not be at rest: a second simulation, with the hand in its reset pose,
-        shows how it moves undisturbed.
+        The object may be moving at the start: a second simulation, with the hand in its reset pose,
+        shows its undisturbed motion.
         """
         index, goal = self._scene.index, pose.start.qpos
         n, driven = index.num_joints, index.driven
@@ -261,7 +264,7 @@ class _Ablation:
         return self.found(goal, pose.retreat_m, pushed, simulated=True)
 
     def _advance(self, retreat: np.ndarray) -> np.ndarray:
-        """Return qpos (nq,) after each finger moved towards its pose until it met something."""
+        """Return qpos (nq,) with each finger moved towards its pose until it touches something."""
         begin = self._start.qpos[self._fingers]
         fingers, done = begin.copy(), np.zeros(len(begin), bool)
         allowed = np.maximum(self._allowed, self._contact.depths(self._pose(retreat, begin)))
@@ -276,21 +279,21 @@ class _Ablation:
         return bool((self._contact.depths(qpos) <= self._allowed + _EXACT_M).all())
 
     def _pose(self, retreat: np.ndarray, fingers: np.ndarray) -> np.ndarray:
-        """Return qpos (nq,) with the base at the wanted distance plus a retreat (3,) m."""
+        """Return qpos (nq,) with the slides at the ablation's distance plus a retreat (3,) m."""
         qpos = self._start.qpos.copy()
         qpos[:3] = self._slides + retreat
         qpos[self._fingers] = fingers
         return self._scene.index.couplings.apply(qpos)
 
     def _room(self, slides: np.ndarray, direction: np.ndarray) -> float:
-        """Return how far the slides can go from a position (3,) along a unit direction (3,), m."""
+        """Return how far the slides can move from (3,) along a unit vector (3,), m."""
         low, high = self._scene.model.jnt_range[:3].T
         moving = np.abs(direction) > 1e-9
         ends = (np.where(direction > 0, high, low) - slides)[moving] / direction[moving]
         return max(0.0, float(ends.min())) if moving.any() else 0.0
 
     def _finger_goal(self) -> np.ndarray:
-        """Return the wanted finger joint positions (J,) rad."""
+        """Return the requested finger joint positions (J,) rad."""
         ranges = self._scene.model.jnt_range[self._fingers]
         if self._cfg.fingers == "keep":
             return self._start.qpos[self._fingers]

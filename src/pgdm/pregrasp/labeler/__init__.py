@@ -1,1 +1,1 @@
-"""Pre-grasps posed by a person on a page in the browser."""
+"""The labeler: a page in the browser on which a person poses a pre-grasp."""

@@ -1,6 +1,6 @@
-"""Restricts the labeler's server to the page of this machine's own browser.
+"""Restricts the labeler's server to its own page, opened on this machine.
 
-The only module that uses viser's private interface, which may change with any version.
+This is the only module that uses viser's private interface, which may change with any version.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from viser.infra import WebsockClientConnection
 from pgdm.errors import PgdmError
 
 HOST = "127.0.0.1"
-"""Only this machine: the page has no password."""
+"""The server listens on this machine only, because the page has no password."""
 VISER = "1.1.1"
 """Version of viser whose private interface :func:`secure` was checked against."""
 _TUNNELS = ("ShareUrlRequest", "ShareUrlDisconnect")
-"""Messages by which a page makes the server publish itself through a tunnel, and stop that."""
+"""Messages with which a page asks the server to open a public tunnel to itself, and to close it."""
 
 
 @contextlib.contextmanager
@@ -35,10 +35,10 @@ def quietly() -> Iterator[None]:
 
 
 def open_server(port: int) -> viser.ViserServer:
-    """Start a server that only a page of this machine can use.
+    """Start a server that only its own page on this machine can use.
 
     Args:
-        port: port to listen at; viser takes the next free one if it is taken.
+        port: port to listen on; if it is taken, viser uses the next free one.
 
     Raises:
         PgdmError: the installed viser cannot be secured.
@@ -54,13 +54,13 @@ def open_server(port: int) -> viser.ViserServer:
 
 
 def secure(server: viser.ViserServer) -> None:
-    """Have a server refuse pages of other sites, and tunnels.
+    """Make a server refuse tunnels and connections from pages of other sites.
 
-    By default viser accepts connections from any page that the user's browser shows, and publishes
-    itself through a tunnel if such a page requests it.
+    By default viser accepts connections from any page that the user's browser shows, and opens a
+    public tunnel if such a page requests it.
 
     Raises:
-        PgdmError: the private interface of the installed viser is another than expected.
+        PgdmError: the private interface of the installed viser differs from the expected one.
     """
     inner: Any = getattr(server, "_websock_server", None)
     handlers, callbacks, connections = (
@@ -82,8 +82,8 @@ def secure(server: viser.ViserServer) -> None:
     allowed = {f"http://{name}:{server.get_port()}" for name in (HOST, "localhost")}
 
     async def check(connection: WebsockClientConnection) -> None:
-        # Browsers always send their page's origin, which the page cannot change; programs send
-        # none. A connection that is not found here raises, which closes it.
+        # Browsers always send the page's origin, which the page cannot change; other programs send
+        # no origin. If the connection is not found, the KeyError makes viser close it.
         socket = connections[connection.client_id]
         origin = socket.request.headers.get("Origin")
         if origin is not None and origin not in allowed:

@@ -1,4 +1,4 @@
-"""Names of a hand's joints for people, such as ``index knuckle``."""
+"""Readable names of a hand's joints, such as ``index knuckle``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PALM = "palm"
 FOREARM = "forearm"
 """Parts of the hand that belong to no finger."""
 WRIST = "Wrist"
-"""Group of the joints that place and turn the hand."""
+"""Group of the base and wrist joints."""
 
 _SLIDES = ("sideways", "forward", "height")  # along the world's x, y, z
 _TURNS = ("tilt", "roll", "turn")  # about the world's x, y, z
@@ -25,7 +25,7 @@ _FINGERS = {
     **dict.fromkeys(("lf", "pf"), "little"),
     **dict.fromkeys(("th", "tf"), "thumb"),
 }
-# For the hands that pgdm ships, by the end of a joint's name; others keep the model's names.
+# By hand, and by the end of a joint's name in the model; other hands show the model's names.
 _JOINTS: dict[str, dict[str, str]] = {
     "adroit": {
         **{"WRJ1": "bend sideways", "WRJ0": "bend"},
@@ -42,27 +42,27 @@ _JOINTS: dict[str, dict[str, str]] = {
 
 @dataclass(frozen=True)
 class Joint:
-    """One joint of the hand, as the page shows it."""
+    """A joint of the hand, as the page shows it."""
 
     index: int
-    """In qpos."""
+    """Index in qpos."""
     label: str
-    """Such as ``spread``."""
+    """Name within the group, such as ``spread``."""
     group: str
-    """``Wrist``, ``Palm``, or the finger's name."""
+    """``Wrist``, ``Palm``, or the finger's name, such as ``Index``."""
     name: str
-    """In the model."""
+    """Name in the model."""
     is_slide: bool
-    """Whether its position is in m, not rad."""
+    """Whether the joint is a slide (position in m) and not a hinge (rad)."""
 
     @property
     def unit(self) -> str:
-        """Unit shown."""
+        """Unit that the page shows."""
         return "mm" if self.is_slide else "deg"
 
     @property
     def scale(self) -> float:
-        """Factor from m or rad to the unit shown."""
+        """Factor from m or rad to the unit that the page shows."""
         return 1e3 if self.is_slide else 180.0 / np.pi
 
     @property
@@ -76,7 +76,7 @@ class Finger:
     """A finger: the joints between the palm and a fingertip."""
 
     name: str
-    """Such as ``index``."""
+    """Name, such as ``index``."""
     tip_body: int
     """Body whose origin is the fingertip."""
     joints: tuple[int, ...]
@@ -121,14 +121,17 @@ def joints(scene: Scene) -> list[Joint]:
 
 
 def _world_axis(scene: Scene, joint: int) -> int:
-    """Return the world axis, 0 to 2, along or about which a base joint moves at zero."""
+    """Return the world axis (0 to 2) nearest to a base joint's axis at base joints of zero."""
     turned = np.empty(3)
     mujoco.mju_rotVecQuat(turned, scene.model.jnt_axis[joint], scene.index.mount_quat)
     return int(np.abs(turned).argmax())
 
 
 def _finger_name(model: mujoco.MjModel, point: str, joints: list[int]) -> str:
-    """Return a finger's name by its joints: D'Manus's points are named after other fingers."""
+    """Return a finger's name from its joints, since D'Manus's points have names of other fingers.
+
+    If the joints' names are unknown, it comes from the name of the finger's point.
+    """
     prefix = model.joint(joints[0]).name.rpartition("/")[2][:2].lower() if joints else ""
     return _FINGERS.get(prefix) or _FINGERS.get(point[:2]) or re.sub(r"[_]?point$", "", point)
 

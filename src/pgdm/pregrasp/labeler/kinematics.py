@@ -1,4 +1,4 @@
-"""Joint positions of the hand for a dragged wrist or fingertip."""
+"""Kinematics of the labeler: joint positions that follow a dragged wrist or fingertip."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from pgdm.pregrasp.labeler import joint_names as names
 from pgdm.sim.scene import Scene
 
 TIP_TOLERANCE_M = 1e-4
-"""A fingertip closer to its target than this has reached it."""
+"""A fingertip has reached its target if it is closer than this."""
 _ITERATIONS = 40
 _STEP_M = 0.02  # longest step of a fingertip towards its target: the Jacobian is only local
-_DAMPING_M = 0.004  # of the least squares, lambda below
-_BEYOND_WEIGHT = 1e6  # cost of an angle beyond its limits, against its distance from the last one
-_PULL = 0.1  # share of the change back to rest, within the null space of the fingertip
+_DAMPING_M = 0.004  # of the least squares, lambda in `Kinematics.reach_tip`
+_BEYOND_WEIGHT = 1e6  # cost of an angle's excess over its limits, relative to its change
+_PULL = 0.1  # share of the way to rest that a step takes in the fingertip Jacobian's null space
 
 
 class Kinematics:
     """Forward and inverse kinematics of a scene's hand, within the joints' limits.
 
     Args:
-        scene: its hand's joints are first in qpos; base joints are three slides,
-            then three hinges, X-Y-Z, on one body.
+        scene: a scene; its hand's n joints are first in qpos. The base has three slides, then three
+            X-Y-Z hinges, all on one body.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -37,7 +37,7 @@ class Kinematics:
         self._jacobian = np.zeros((3, scene.model.nv))
 
     def forward(self, qpos: np.ndarray) -> mujoco.MjData:
-        """Return the scene's kinematics at qpos (nq,); the next call overwrites them."""
+        """Return the scene's kinematics at qpos (nq,); the next call overwrites the result."""
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self.data)
         mujoco.mj_comPos(self._model, self.data)
@@ -53,15 +53,15 @@ class Kinematics:
         return self.forward(qpos).xpos[self.fingers[finger].tip_body].copy()
 
     def place_wrist(self, qpos: np.ndarray, pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
-        """Return joints (n,) that bring the wrist to a pose as near as the base's limits allow.
+        """Return joints (n,) that bring the wrist to a pose, clipped to the joints' limits.
 
-        The inverse of :meth:`wrist_pose`. Of the hinge angles with that orientation, those within
-        the limits are preferred, then those nearest to the last pose.
+        The inverse of :meth:`wrist_pose`. Several triples of hinge angles give the orientation:
+        those within the limits are preferred, then those nearest to the last pose.
 
         Args:
             qpos: the last pose (nq,).
             pos: position of the wrist, (3,) m, world frame.
-            quat: quaternion of the mount's body, (4,) wxyz.
+            quat: orientation of the mount body, (4,) wxyz, world frame.
         """
         data, flat = self.forward(qpos), np.empty(9)
         base = data.xmat[self._base].reshape(3, 3)
@@ -75,7 +75,10 @@ class Kinematics:
         return joints.clip(self.low, self.high)
 
     def _nearest(self, hinges: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """Return, of triples of angles (2, 3) rad plus full turns, the one nearest to another."""
+        """Return the triple of ``hinges`` (2, 3) rad, plus full turns, that is nearest to ``near``.
+
+        Triples within the limits have priority.
+        """
         low, high = self.low[3:6], self.high[3:6]
         found = []
         for angles in hinges:
@@ -92,18 +95,18 @@ class Kinematics:
     ) -> tuple[np.ndarray, float]:
         """Return joints (n,) that bring a fingertip as near to a target as its finger can.
 
-        Damped least squares with the fingertip's Jacobian J, for a step e towards the target and a
-        pull p towards rest in J's null space:
+        Damped least squares with the fingertip's Jacobian J and its damped pseudo-inverse J#, for a
+        step e towards the target and a pull p towards ``rest`` in J's null space:
 
             dq = J# e + (I - J# J) p        J# = J^T (J J^T + lambda^2 I)^-1
 
-        Joints that would exceed their limits are left out of a step.
+        Joints at a limit that would exceed it are left out of a step.
 
         Args:
             qpos: the last pose (nq,).
-            finger: number of the finger; only its joints move.
+            finger: index of the finger; only its joints move.
             target: target of the fingertip, (3,) m, world frame.
-            rest: joints (n,) to stay near.
+            rest: joints (n,) that the finger should stay near.
 
         Returns:
             The joints, and the fingertip's distance from the target, m.
@@ -136,7 +139,7 @@ class Kinematics:
 
 
 def _damped(jacobian: np.ndarray, step: np.ndarray, pull: np.ndarray) -> np.ndarray:
-    """Return the change of qpos (J,) for a step (3,), with a pull (J,) in the null space."""
+    """Return the change (J,) of J joints for a step (3,) m, with a pull (J,) in the null space."""
     square = jacobian @ jacobian.T + _DAMPING_M**2 * np.eye(3)
     inverse = jacobian.T @ np.linalg.inv(square)
     back = _PULL * pull

@@ -1,4 +1,4 @@
-"""One thread that runs the actions of all pages, one after the other."""
+"""A queue of actions from all pages, run one after the other by a single thread."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Action = Callable[[], None]
 
 
 class Mailbox:
-    """Actions posted by any thread, run in order by one.
+    """Runs actions posted by any thread, in order, on a thread of its own.
 
-    Of consecutive waiting actions with the same key only the last runs, so that a drag faster than
-    the machine computes does not queue up.
+    If consecutive waiting actions have the same key, only the last one runs. So the updates of a
+    drag do not pile up when they come faster than they can be computed.
 
     Args:
-        complain: receives the message if an action fails.
+        complain: receives the error message if an action fails.
     """
 
     def __init__(self, complain: Callable[[str], None]) -> None:
@@ -33,7 +33,7 @@ class Mailbox:
         self._thread.start()
 
     def post(self, action: Action, key: Hashable = None) -> None:
-        """Queue an action; it replaces the last one waiting if that has the same key."""
+        """Queue an action; it replaces the last waiting action if both have the same key."""
         with self._condition:
             if key is not None and self._waiting and self._waiting[-1][0] == key:
                 self._waiting.pop()
@@ -41,12 +41,12 @@ class Mailbox:
             self._condition.notify_all()
 
     def wait(self, timeout_s: float = 60.0) -> bool:
-        """Wait until all actions have run; return false on timeout."""
+        """Wait until all actions have run; return False on timeout."""
         with self._condition:
             return self._condition.wait_for(lambda: not self._waiting and not self._busy, timeout_s)
 
     def close(self) -> None:
-        """Run the waiting actions, and stop."""
+        """Run the waiting actions, then stop the thread; wait for it at most 10 s."""
         with self._condition:
             self._ended = True
             self._condition.notify_all()
@@ -66,7 +66,7 @@ class Mailbox:
                 self._complain(str(error))
             except OSError as error:
                 self._complain(f"{error.filename or ''} {error.strerror or error}".strip())
-            except Exception as error:  # noqa: BLE001 a bug must not take the page and its pose down
+            except Exception as error:  # noqa: BLE001 a bug must not end the thread
                 _log.exception("an action of the labeler failed")
                 self._complain(f"bug in pgdm: {type(error).__name__}: {error}")
             with self._condition:

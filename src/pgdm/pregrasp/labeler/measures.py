@@ -1,4 +1,4 @@
-"""Metrics of a pose, fast enough to be shown while it changes."""
+"""Metrics of a pose, computed fast enough to be shown while the pose changes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from pgdm.sim.contact import FREE_M, FingertipDistance
 from pgdm.sim.scene import Scene
 
 BEYOND = 0.01
-"""How far, m or rad, a joint may exceed its actuator's range: some ranges are rounded."""
+"""A joint counts as outside its actuator's range if it exceeds it by more, m or rad: some ranges
+are rounded."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +22,9 @@ class Touch:
     """A part of the hand that penetrates something."""
 
     part: str
-    """A finger, ``palm``, or ``forearm``: what does not move with the wrist's joints."""
+    """Name of a finger, ``palm``, or ``forearm`` (everything before the wrist joints)."""
     body: str
-    """What it penetrates."""
+    """Name of the object that it penetrates, or ``the floor``."""
     depth_m: float
 
 
@@ -32,17 +33,18 @@ class Metrics:
     """Contacts and distances of a pose."""
 
     touches: tuple[Touch, ...]
-    """One for each part and body, deepest first."""
+    """The deepest penetration of each part into each object, deepest first."""
     links: frozenset[int]
-    """Bodies of the hand that penetrate something."""
+    """Ids of the hand's bodies that penetrate something."""
     tip_distances_m: np.ndarray
-    """Distance from each fingertip's surface to the object's (F,); negative inside."""
+    """Distance from the surface of each finger's last link to the object's, (F,); negative if it
+    penetrates."""
     beyond: tuple[str, ...]
     """Joints whose position is outside their actuator's range."""
 
     @property
     def free(self) -> bool:
-        """Whether the hand touches nothing but itself."""
+        """Whether the hand touches nothing but itself (no penetration above 0.1 mm)."""
         return not self.touches
 
     @property
@@ -61,7 +63,7 @@ class Meter:
     """Measures poses of one scene.
 
     Args:
-        scene: its actuated joints are the hand's, first in qpos.
+        scene: a scene; the hand's actuated joints are first in qpos.
         kinematics: kinematics of the same scene.
     """
 
@@ -103,13 +105,13 @@ class Meter:
         return tuple(self._names[i] for i in outside)
 
     def _name(self, body: int) -> str:
-        """Return the name to show for a body: that of its object, or the floor."""
+        """Return the name to show for a body: that of its object, or ``the floor``."""
         name = self._model.body(body).name or "the floor"
         return "the floor" if name == "world" else name.partition("/")[0]
 
 
 def _parts(model: mujoco.MjModel, num_base: int, fingers: list[names.Finger]) -> list[str]:
-    """Return the part of the hand that each body belongs to."""
+    """Return the name of the hand's part that each body belongs to, for all bodies."""
     wrist = list(range(num_base, min(finger.joints[0] for finger in fingers)))
     part = [names.FOREARM if wrist else names.PALM] * model.nbody
     base = {int(model.jnt_bodyid[joint]): names.PALM for joint in wrist}

@@ -1,4 +1,4 @@
-"""The labeler in the browser: all pages share one state, which one thread changes."""
+"""The labeler's page: all browser tabs share one state, which only one thread changes."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from pgdm.sim.scene import Scene
 
 
 class LabelPage:
-    """Serves the page until it is closed.
+    """Serves the page until :meth:`close`.
 
     Args:
-        scene: the task's, with the hand.
-        poses: that can be loaded.
+        scene: scene of the task with the hand to pose.
+        poses: poses that can be loaded.
         start: the first pose.
         draft: keeps the unsaved pose.
         shapes: visible shapes and collision shapes.
         substeps: physics steps per control step.
-        port: port to listen at, on this machine only; the next free one if it is taken.
+        port: port to listen on, on this machine only; the next free one if it is taken.
     """
 
     def __init__(
@@ -46,11 +46,11 @@ class LabelPage:
         self.state = LabelState(scene, start.qpos)
         self._scene, self._poses, self._draft, self._substeps = scene, poses, draft, substeps
         self.dragged: object = None
-        """The handle being dragged: ``wrist`` or the number of a finger; None if there is none."""
+        """The handle being dragged: ``wrist`` or the index of a finger; None if none is."""
         self._drags = 0
-        self._saved = False  # whether the stored pose is of this page
+        self._saved = False  # whether this page has saved the stored pose
         self._trial: Trial | None = None
-        self._outcome: tuple[int, Outcome] | None = None  # with the version of the state tried
+        self._outcome: tuple[int, Outcome] | None = None  # version of the tried state, outcome
         self.mailbox = Mailbox(lambda text: self.panel.complain(text))
         self.server = guard.open_server(port)
         self.stage = Stage(self.server, scene, self.state.kinematics, *shapes)
@@ -67,15 +67,19 @@ class LabelPage:
 
     @property
     def idle(self) -> bool:
-        """Whether no trial runs."""
+        """Whether no trial is running."""
         return self._trial is None
 
     def save(self, anyway: bool = False) -> None:
-        """Save the pose; one that touches something only with ``anyway``."""
+        """Save the pose.
+
+        Args:
+            anyway: also save if the hand touches something or an earlier pose would be replaced.
+        """
         self.mailbox.post(lambda: self._save(anyway))
 
     def close(self) -> None:
-        """Stop the server; an unsaved pose stays as a draft."""
+        """Stop the server; an unsaved pose is kept as a draft."""
         self._cancel()
         guard.close_server(self.server)
         self.mailbox.close()
@@ -99,7 +103,7 @@ class LabelPage:
         )
 
     def set_joint(self, joint: int, value: float, gesture: object) -> None:
-        """Set a joint, m or rad, as a slider does."""
+        """Set a joint, m or rad; changes with equal ``gesture`` are undone together."""
 
         def action() -> None:
             self._change(lambda: self.state.set_joint(joint, value, gesture), joint)
@@ -107,15 +111,15 @@ class LabelPage:
         self.mailbox.post(action, gesture)
 
     def drag_wrist(self, pos: np.ndarray, quat: np.ndarray, phase: str) -> None:
-        """Move the wrist with its handle: (3,) m, (4,) wxyz; phase start, update or end."""
+        """Move the wrist to its handle: (3,) m, (4,) wxyz; phase start, update or end."""
         self._drag("wrist", phase, lambda g: self.state.place_wrist(pos, quat, g))
 
     def drag_tip(self, finger: int, pos: np.ndarray, phase: str) -> None:
-        """Move a fingertip with its handle: (3,) m; phase start, update or end."""
+        """Move a fingertip to its handle: (3,) m; phase start, update or end."""
         self._drag(finger, phase, lambda g: self.state.place_tip(finger, pos, g))
 
     def _drag(self, handle: object, phase: str, move: Callable[[object], object]) -> None:
-        """Follow a drag: grabbing a handle moves nothing, releasing it puts it back on the hand."""
+        """Follow a drag; when released, the handle returns to where the hand could get."""
         self._drags += phase == "start"
         gesture = "drag", handle, self._drags
 
@@ -165,7 +169,7 @@ class LabelPage:
         self.panel.offer_anyway((earlier or not self.state.metrics.free) and not anyway)
         if earlier and not anyway:
             raise ConfigError(
-                f"not saved: {path} holds a pose of an earlier time; 'Save anyway' replaces it"
+                f"not saved: {path} already holds an earlier pose; 'Save anyway' replaces it"
             )
         pregrasp_file.write(path, store.pregrasp(self.state, outcome.reached, anyway, outcome.note))
         self._saved = True

@@ -1,4 +1,4 @@
-"""The controls next to the scene, and the messages above them."""
+"""The labeler's controls next to the scene, and the messages above them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pgdm.pregrasp.labeler.state import LabelState
 from pgdm.sim.contact import FAR_M
 
 PAUSE_S = 1.0
-"""A slider that rests this long starts a new step of the history."""
+"""Moving a slider after a pause longer than this starts a new step of the undo history."""
 _ORDER = (WRIST, "Index", "Middle", "Ring", "Little", "Thumb")
 _STEP = 0.1  # of the sliders, mm and degrees
 GREEN, _RED, _AMBER = "#2f9e44", "#e03131", "#e8890c"
@@ -26,10 +26,10 @@ HANDLES = ("all", "wrist", "fingertips", "none")
 
 @dataclass(frozen=True)
 class Commands:
-    """Functions behind the controls, called in the order of the clicks."""
+    """Functions that the controls call, in the order of the clicks."""
 
     set_joint: Callable[[int, float, object], None]
-    """Called with joint, value in m or rad, and gesture."""
+    """Called with the joint's index, its value in m or rad, and the gesture that sets it."""
     preset: Callable[[str], None]
     undo: Callable[[], None]
     redo: Callable[[], None]
@@ -37,19 +37,19 @@ class Commands:
     try_it: Callable[[], None]
     cancel: Callable[[], None]
     save: Callable[[bool], None]
-    """Called with whether to save even if the hand touches something."""
+    """Called with whether to save anyway: if the hand touches something or a pose is replaced."""
     handles: Callable[[str], None]
     solid: Callable[[bool], None]
 
 
 class Panel:
-    """The controls of all pages.
+    """The controls, shared by all open pages.
 
     Args:
-        server: server of the pages.
-        state: the pose shown.
+        server: the labeler's server.
+        state: the pose to show.
         presets: names of the poses that can be loaded.
-        commands: what the controls do.
+        commands: functions that the controls call.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Panel:
         self.say(text, _RED)
 
     def show(self, metrics: Metrics, moved_by: int | None) -> None:
-        """Show the pose and its metrics; the slider being moved stays as it is."""
+        """Show the pose and its metrics, without changing the slider of joint ``moved_by``."""
         qpos = self._state.qpos
         for joint in self._state.joints:
             slider = self._sliders[joint.index]
@@ -100,11 +100,11 @@ class Panel:
         self._metrics.content = _block(_as_html(metrics, self._state))
 
     def offer_anyway(self, offered: bool) -> None:
-        """Show or hide the button that saves even if the hand touches something."""
+        """Show or hide the button 'Save anyway'."""
         self._anyway.visible = offered
 
     def progress(self, share: float | None, text: str) -> None:
-        """Show the trial's progress (0..1), None if none runs, and its description."""
+        """Show the trial's progress (0..1; None if no trial is running) and its description."""
         running = share is not None
         self._try.disabled, self._cancel.visible = running, running
         self._bar.visible = running
@@ -169,14 +169,14 @@ class Panel:
         self._sliders[joint.index] = slider
 
         async def moved(event: viser.GuiEvent) -> None:
-            if event.client_id is not None:  # a person, not `show`
+            if event.client_id is not None:  # moved by a person, not by `show`
                 value = float(event.target.value) / joint.scale
                 self._do.set_joint(joint.index, value, self._gesture_of(joint.index))
 
         slider.on_update(moved)
 
     def _gesture_of(self, joint: int) -> object:
-        """Return the gesture of a slider's movement; after a pause it is a new one."""
+        """Return an id of a slider's movement: a new one after a pause or on another slider."""
         before, when, number = self._gesture
         now = time.monotonic()
         number += before != joint or now - when > PAUSE_S
@@ -189,7 +189,7 @@ def _rank(group: str) -> tuple[int, str]:
 
 
 def _handler(action: Callable[[Any], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
-    """Return a listener for viser; a coroutine, so that events are handled in their order."""
+    """Return a viser callback; as a coroutine, because viser runs those in the order of events."""
 
     async def handle(event: Any) -> None:
         action(event)

@@ -1,4 +1,4 @@
-"""Poses that the labeler loads, saves, and keeps as drafts."""
+"""Poses that the labeler loads and saves, and its draft of the unsaved pose."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ SOURCE = "labeled"
 PRESETS = ("mined", "planned", "learned", "mocap", "teleop", "labeled", "mean", "open", "none")
 """Names of the poses that can be loaded, besides files."""
 DEFAULTS = ("labeled", "planned", "mined", "mocap", "none")
-"""The labeler starts from the first of these that exists, unless told otherwise."""
+"""By default the labeler starts from the first of these that exists."""
 AUTOSAVE_S = 1.0
-"""Interval of saving the draft: a killed labeler loses no more than this."""
+"""Interval at which the draft is saved: if the labeler is killed, at most this much is lost."""
 
 
 @dataclass(frozen=True)
@@ -39,23 +39,23 @@ class Loaded:
 
     qpos: np.ndarray  # (nq,) m, rad
     origin: str
-    """Its origin, in words."""
+    """Where the pose comes from, in words."""
     notes: tuple[str, ...] = ()
-    """Messages for the user, such as what was repaired."""
+    """Messages for the user, such as which joints were clipped."""
 
 
 class Poses:
     """Poses of one task and hand, stored or computed.
 
     Args:
-        scene: the task's, with the hand.
-        motion: the task's, with its stored starts.
+        scene: scene of the task with the hand to pose.
+        motion: motion of the task, with its stored starts.
     """
 
     def __init__(self, scene: Scene, motion: Motion) -> None:
         self._scene, self._motion = scene, motion
         self._n = scene.index.num_joints
-        self._base = reset_state(motion, scene)  # where the objects are, whatever the hand
+        self._base = reset_state(motion, scene)  # its objects are used in every pose
 
     def available(self) -> list[str]:
         """Return the presets that exist."""
@@ -69,12 +69,13 @@ class Poses:
         """Return the pose of a preset or of a file.
 
         Args:
-            name: name of :data:`PRESETS`, or a pre-grasp's file.
-            wrist: joints (n,) whose wrist the presets ``mean`` and ``open`` keep; by default
-                those of :meth:`first`.
+            name: one of :data:`PRESETS`, or the path of a pre-grasp file.
+            wrist: joints (n,) whose base and wrist joints the presets ``mean`` and ``open`` keep;
+                by default those of :meth:`first`.
 
         Raises:
-            ConfigError: there is no such pose, or it is for another hand or scene.
+            UnknownNameError: the name is neither a preset nor a path.
+            ConfigError: the pose does not exist, or is for another hand or scene.
             CorruptAssetError: a file is damaged.
         """
         if name in ("mean", "open"):
@@ -89,11 +90,11 @@ class Poses:
         return self._file(paths.expanded(name))
 
     def read(self, path: Path, origin: str) -> Loaded:
-        """Return the pose of a pre-grasp's file.
+        """Return the pose of a pre-grasp file.
 
         Raises:
-            ConfigError: it is for another hand or scene.
-            CorruptAssetError: it is damaged.
+            ConfigError: the pose is for another hand or scene.
+            CorruptAssetError: the file is damaged.
         """
         pregrasp = pregrasp_file.read(path)
         task, hand = self._scene.task.id, self._scene.hand.name
@@ -136,11 +137,11 @@ class Poses:
         return qpos[: self._n]
 
     def _with(self, joints: np.ndarray, origin: str, notes: tuple[str, ...] = ()) -> Loaded:
-        """Return a pose with the hand's joints, clipped to their limits."""
+        """Return a pose with the given hand joints, clipped to their limits (with a note)."""
         low, high = self._scene.model.jnt_range[: self._n].T
         inside = joints.clip(low, high)
         beyond = np.abs(joints - inside)
-        if beyond.max() > 1e-3:  # the released files are rounded
+        if beyond.max() > 1e-3:  # smaller excesses are rounding errors of the released files
             worst = self._scene.model.joint(int(beyond.argmax())).name
             notes += (
                 f"{int((beyond > 1e-3).sum())} joints of the {origin} exceeded their limits and "
@@ -156,19 +157,25 @@ class Poses:
 
 
 def path(scene: Scene) -> Path:
-    """Return the file of a scene's labeled pre-grasp."""
+    """Return the path of a scene's labeled pre-grasp."""
     return pregrasp_file.path_of(scene.task.id, scene.hand.name, SOURCE)
 
 
 def draft_path(scene: Scene) -> Path:
-    """Return the file of the unsaved pose."""
+    """Return the path of the draft."""
     return path(scene).with_name(f"{SOURCE}.draft.npz")
 
 
 def pregrasp(
     state: LabelState, reached: Start | None, anyway: bool, extra: Mapping[str, Any]
 ) -> Pregrasp:
-    """Return the pre-grasp of a pose, with its note.
+    """Return a pose as a pre-grasp, with a note on its origin and quality.
+
+    Args:
+        state: the pose.
+        reached: state in which a reach to the pose ends, if there is one.
+        anyway: whether the hand may touch something.
+        extra: further entries of the note.
 
     Raises:
         ConfigError: the hand touches something, and ``anyway`` is false.
@@ -196,10 +203,10 @@ def _still(scene: Scene, qpos: np.ndarray) -> Start:
 class Draft:
     """Keeps the unsaved pose in a file, at most a second behind.
 
-    Only one labeler at a time can work on a task and hand.
+    A lock ensures that only one labeler at a time works on a task and hand.
 
     Args:
-        scene: the task's, with the hand.
+        scene: scene of the task with the hand to pose.
 
     Raises:
         RunError: task and hand are open in another labeler.
@@ -220,12 +227,15 @@ class Draft:
         self._changed, self._guard = threading.Event(), threading.Lock()
         self._ended = False
         self.error: OSError | None = None
-        """Why the last draft could not be written, if it could not."""
+        """Error of the last attempt to write the draft; None if it succeeded."""
         self._thread = threading.Thread(target=self._run, name="labeler-draft", daemon=True)
         self._thread.start()
 
     def found(self, poses: Poses) -> Loaded | None:
-        """Return the draft of an earlier labeler; a damaged one is set aside, with a note."""
+        """Return the draft that an earlier labeler left, or None.
+
+        If the draft is unusable, rename it and return the default pose with a note on that.
+        """
         if not self._path.is_file():
             return None
         when = time.strftime("%Y-%m-%d %H:%M", time.localtime(self._path.stat().st_mtime))
@@ -237,19 +247,19 @@ class Draft:
             return replace(loaded, notes=(*loaded.notes, f"{error}; kept as {aside.name}"))
 
     def set_aside(self) -> Path:
-        """Rename the draft of an earlier labeler, and return its new path."""
+        """Rename the draft that an earlier labeler left, and return its new path."""
         aside = self._path.with_name(f"{SOURCE}.draft-before.npz")
         self._path.replace(aside)
         return aside
 
     def keep(self, qpos: np.ndarray) -> None:
-        """Keep a pose (nq,) as the draft, soon to be written."""
+        """Make a pose (nq,) the draft; it is written within :data:`AUTOSAVE_S`."""
         with self._guard:
             self._latest = qpos
         self._changed.set()
 
     def drop(self) -> None:
-        """Remove the draft: its pose is saved."""
+        """Remove the draft, once its pose is saved."""
         with self._guard:
             self._latest = None
             self._path.unlink(missing_ok=True)
@@ -260,7 +270,7 @@ class Draft:
         self._changed.set()
         self._thread.join()
         self._write()
-        self._lock.release()  # its file stays: another labeler may hold it by now
+        self._lock.release()  # the lock file stays: another labeler may already hold it
 
     def _run(self) -> None:
         while not self._ended:

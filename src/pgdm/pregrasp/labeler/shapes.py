@@ -1,4 +1,4 @@
-"""Triangles of a scene's bodies, for display: visible geoms and collision geoms."""
+"""Triangle meshes of a scene's visible geoms and collision geoms, for display."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pgdm.pregrasp.primitives import primitive
 from pgdm.sim.scene import Scene
 
 OBJECT_RGB = np.array([0.29, 0.55, 0.66])
-"""Colour of the tracked object, which the released scenes paint like the hand."""
+"""Colour of the tracked object; the released scenes give it the hand's colour."""
 TABLE_RGB = np.array([0.52, 0.50, 0.47])
 SOLID_RGB = np.array([0.55, 0.62, 0.95])
 """Colour of collision geoms."""
-_DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # in MuJoCo: use the material's
-_LAST_GROUP = 2  # MuJoCo's viewers show the first three groups of geoms
+_DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # MuJoCo's default: use the material
+_LAST_GROUP = 2  # MuJoCo's viewers show geom groups 0 to 2
 _CREASE_RAD = 0.6  # edges sharper than this are not smoothed
-_MAX_FACES = 3000  # of a mesh: servos are modelled down to their screw threads
+_MAX_FACES = 3000  # per mesh; larger ones are simplified, such as servos with screw threads
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Shape:
     """Triangles of one colour that move with a body."""
 
     body: int
-    vertices: np.ndarray  # (V, 3) m, the body's frame
-    faces: np.ndarray  # (F, 3)
-    rgb: tuple[int, int, int]
+    vertices: np.ndarray  # (V, 3) m, in the body's frame
+    faces: np.ndarray  # (F, 3) indices of vertices
+    rgb: tuple[int, int, int]  # 0..255
 
 
 def visible(scene: Scene) -> list[Shape]:
@@ -66,11 +66,11 @@ def _collides(model: mujoco.MjModel, geom: int) -> bool:
 
 
 def _seen(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return a body's visible geoms: its visual ones if it has a visual mesh, else all."""
+    """Return a body's visible geoms: only non-colliding ones if it has a visual mesh, else all."""
     shown = [g for g in _geoms(model, body) if model.geom_group[g] <= _LAST_GROUP]
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     looks = [g for g in shown if is_mesh[g] and not _collides(model, g)]
-    # Some visual meshes of the released files are transparent, but there is nothing else to show.
+    # Visual meshes are shown even if transparent: some bodies of the released files have no others.
     if looks:
         solid_too = [g for g in shown if not is_mesh[g] and not _collides(model, g)]
         return looks + [g for g in solid_too if _alpha(model, g) > 0]
@@ -107,7 +107,10 @@ def _shape(body: int, rgb: tuple[int, int, int], parts: list[trimesh.Trimesh]) -
 def _triangles(
     model: mujoco.MjModel, geom: int, meshes: dict[int, trimesh.Trimesh]
 ) -> trimesh.Trimesh:
-    """Return a geom's surface in its body's frame, smooth except for creases; caches meshes."""
+    """Return a geom's surface in its body's frame, with smooth shading except at creases.
+
+    ``meshes`` caches the surfaces of mesh geoms by mesh id.
+    """
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         data = int(model.geom_dataid[geom])
         if data not in meshes:

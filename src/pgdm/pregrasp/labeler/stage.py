@@ -1,4 +1,4 @@
-"""The scene on the page: moving bodies, warning colours, handles to drag."""
+"""The 3D scene on the labeler's page: moving bodies, warning colours, handles to drag."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ from pgdm.sim.scene import Scene
 
 INSIDE_RGB = (222, 45, 38)
 """Colour of links that penetrate something."""
-_STILL = 1e-7  # change of position (m) or quaternion below which a body is not sent again
-_ASPECT = 1.2  # of the part of the page that shows the scene
-_NEARER = 0.85  # distance relative to a video's camera: the forearm need not be in view
+_STILL = 1e-7  # change of position (m) or quaternion below which a pose is not sent again
+_ASPECT = 1.2  # aspect ratio of the part of the page that shows the scene
+_NEARER = 0.85  # camera distance relative to that in videos: the forearm need not be in view
 _WRIST_SCALE, _TIP_SCALE = 0.11, 0.04  # m, size of the handles
 
 OnWrist = Callable[[np.ndarray, np.ndarray, str], None]
-"""Called with position (3,), orientation (4,) and phase (start, update, end) of its handle."""
+"""Called with the wrist handle's position (3,) m, orientation (4,) wxyz, and the drag's phase
+(start, update, end)."""
 OnTip = Callable[[int, np.ndarray, str], None]
-"""Called with finger, position (3,) and phase of its handle."""
+"""Called with the finger's index, its handle's position (3,) m, and the drag's phase."""
 
 
 class Stage:
-    """Draws the scene, shared by all pages.
+    """Draws the scene, shared by all open pages.
 
     Args:
-        server: server of the pages.
+        server: the labeler's server.
         scene: scene to draw.
         kinematics: kinematics of the scene.
         looks: visible shapes.
@@ -66,7 +67,7 @@ class Stage:
         self.tips = [self._tip(finger.name) for finger in kinematics.fingers]
 
     def on_drag(self, wrist: OnWrist, tip: OnTip) -> None:
-        """Call functions when handles are dragged, in order."""
+        """Call the functions when handles are dragged, in the order of the events."""
 
         async def wrist_moved(event: viser.TransformControlsEvent) -> None:
             handle = event.target
@@ -81,7 +82,7 @@ class Stage:
             handle.on_update(tip_moved)
 
     def aim(self, server: viser.ViserServer, qpos: np.ndarray) -> None:
-        """Set the first view of new pages: hand and object, unobstructed."""
+        """Set the initial camera of new pages: hand and object in view, unobstructed."""
         model, index = self._scene.model, self._scene.index
         data = self._kinematics.forward(qpos)
         hand = data.geom_xpos[index.point_geoms]
@@ -107,11 +108,11 @@ class Stage:
                 frame.wxyz = data.xquat[body]
 
     def handles(self, qpos: np.ndarray, dragged: object) -> None:
-        """Move all handles to wrist and fingertips at qpos (nq,), except the one being dragged.
+        """Move the handles to the wrist and fingertips, except the handle being dragged.
 
         Args:
-            qpos: the pose.
-            dragged: ``wrist``, the number of a finger, or None.
+            qpos: the pose (nq,).
+            dragged: ``wrist``, the index of a finger, or None.
         """
         pos, quat = self._kinematics.wrist_pose(qpos)
         if dragged != "wrist":
@@ -140,7 +141,7 @@ class Stage:
             mesh.visible = shown
 
     def _drawn(self, body: int) -> int:
-        """Return the nearest visible body from a body towards the palm."""
+        """Return a body if it is drawn, else its nearest ancestor that is."""
         while body not in self._parts and body:
             body = int(self._scene.model.body_parentid[body])
         return body
@@ -148,7 +149,7 @@ class Stage:
     def _lights(self) -> None:
         scene = self._scene_api
         scene.configure_environment_map("studio", environment_intensity=0.25)
-        # viser's shadows are for rooms: a hand over a table casts none, but they cost time.
+        # viser's shadows suit whole rooms: a hand over a table shows none, but they cost time.
         scene.configure_default_lights(cast_shadow=False)
         scene.world_axes.visible = False
 

@@ -1,4 +1,4 @@
-"""The pose being edited: its joints, history and metrics. Independent of the page."""
+"""The pose being edited: its joints, undo history and metrics, independent of the page."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from pgdm.pregrasp.labeler.measures import Meter, Metrics
 from pgdm.sim.scene import Scene
 
 MAX_UNDO = 500
-"""Most steps that can be undone."""
+"""Largest number of steps that can be undone."""
 
 
 class LabelState:
     """A pose of the hand in a scene with fixed objects.
 
-    A change keeps the joints within their limits, and is a step of the history, or part of the last
-    step if both belong to the same gesture, such as a drag.
+    Every change keeps the joints within their limits. It is a new step of the undo history, unless
+    it belongs to the same gesture as the last step, such as one drag.
 
     Args:
-        scene: the task's, with any hand.
+        scene: scene of the task, with any hand.
         qpos: the first pose (nq,); joints beyond their limits are clipped.
     """
 
@@ -40,7 +40,7 @@ class LabelState:
         self._rest = self._start
         self._measured: Metrics | None = None
         self.version = 0
-        """Increases with every change."""
+        """Number of changes so far."""
 
     @property
     def qpos(self) -> np.ndarray:
@@ -68,7 +68,7 @@ class LabelState:
         """Set all joint positions of the hand, (n,) m and rad.
 
         Raises:
-            ConfigError: their number is wrong, or a value is NaN or infinite.
+            ConfigError: there are too many or too few, or a value is NaN or infinite.
         """
         joints, before = self._checked(joints), self._joints
         continues = self._rested(gesture)
@@ -81,7 +81,7 @@ class LabelState:
         self._move(joints, gesture)
 
     def place_wrist(self, pos: np.ndarray, quat: np.ndarray, gesture: object = None) -> None:
-        """Bring the wrist to a position (3,) m and the mount to an orientation (4,) wxyz, world."""
+        """Bring the wrist to (3,) m and the mount body to (4,) wxyz, world frame, within limits."""
         if not (np.isfinite(pos).all() and np.isfinite(quat).all() and np.linalg.norm(quat) > 0.1):
             raise ConfigError(f"the wrist cannot go to {pos}, {quat}: not a finite pose")
         self.set_joints(self.kinematics.place_wrist(self._qpos, pos, quat), gesture)
@@ -90,7 +90,7 @@ class LabelState:
         """Bring a fingertip as near to a point (3,) m, world frame, as its finger can.
 
         Returns:
-            Its distance from the point, m.
+            The fingertip's distance from the point, m.
         """
         if not np.isfinite(target).all():
             raise ConfigError(f"the fingertip cannot go to {target}: not a finite position")
@@ -104,11 +104,11 @@ class LabelState:
         return self._restore(self._undo, self._redo)
 
     def redo(self) -> bool:
-        """Redo the step undone last; return whether there was one."""
+        """Redo the last undone step; return whether there was one."""
         return self._restore(self._redo, self._undo)
 
     def reset(self) -> None:
-        """Return to the first pose, as a step of the history."""
+        """Return to the first pose, as a new step of the undo history."""
         self.set_joints(self._start)
 
     def _restore(self, steps: list[np.ndarray], opposite: list[np.ndarray]) -> bool:
@@ -119,7 +119,7 @@ class LabelState:
         return True
 
     def _rested(self, gesture: object) -> bool:
-        """Return whether a gesture continues; if not, fingers then rest where they are now."""
+        """Return whether a gesture continues; if not, the present joints become the rest pose."""
         continues = gesture is not None and gesture == self._gesture
         if not continues:
             self._rest = self._joints

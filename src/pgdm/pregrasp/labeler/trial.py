@@ -1,4 +1,4 @@
-"""A trial of a pose in the simulation: reach it, then grasp and lift."""
+"""A trial of a pose in simulation: plan the reach to the pose, then grasp and lift."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pgdm.pregrasp.sources import reset_pose
 from pgdm.sim.scene import Scene
 
 PLAN_SHARE = 0.7
-"""Share of the planner in a trial's time, for the progress bar."""
+"""Share of a trial's time that the reach planner takes, for the progress bar."""
 _log = logging.getLogger(__name__)
 
 
@@ -32,9 +32,9 @@ class Outcome:
     """Result of a trial."""
 
     reached: Start | None
-    """State in which the reach ends, with its plan; None if it does not reach the pose."""
+    """State in which the reach ends, with its plan; None if the plan fails to reach the pose."""
     note: Mapping[str, Any]
-    """Metrics, plain JSON."""
+    """Metrics as plain JSON, for the note of the pre-grasp's file."""
 
 
 class _CancelError(Exception):
@@ -42,15 +42,15 @@ class _CancelError(Exception):
 
 
 class Trial:
-    """Tries a pose in its own thread.
+    """Tries a pose in a thread of its own.
 
     Args:
-        scene: the task's, with the hand.
+        scene: scene of the task with the hand.
         qpos: the pose to try (nq,).
         substeps: physics steps per control step.
-        on_progress: receives the progress (0..1), and a description.
-        on_state: receives the states of the plan (nq,) in real time; returns false to stop.
-        on_end: receives the outcome, None without one, and a description.
+        on_progress: receives the progress (0..1) and its description.
+        on_state: receives the states of the plan (nq,) in real time; returns False to stop.
+        on_end: receives the outcome (None if cancelled or failed) and its description.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Trial:
         self._thread.start()
 
     def cancel(self) -> None:
-        """Stop it soon, without an outcome."""
+        """Stop the trial soon: without an outcome, unless the plan is already being played."""
         self._cancelled.set()
 
     def _run(self) -> None:
@@ -92,7 +92,7 @@ class Trial:
 
         def progress(step: str, done: int, total: int) -> None:
             self._check()
-            if not done:  # nothing to estimate from
+            if not done:  # the time left is unknown before the first round
                 return
             left = (time.monotonic() - began) / done * (total - done)
             text = f"planning the reach: round {done} of at most {total}, {left:.0f} s left"

@@ -1,4 +1,4 @@
-"""Candidates for a pre-grasp: sampled, freed from contact, ranked by the object's lift rate."""
+"""Candidates for a pre-grasp: sampled, freed from penetration, ranked by their lift rates."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
 
 OVERSAMPLING = 3
-"""Samples per candidate that is lift-tested."""
+"""Number of samples drawn for each candidate that is kept for the lift test."""
 _FREEING = FreeingCfg(0.01, 0.08, depth_weight=1e3, population=48, patience=6)
 
 
@@ -30,7 +30,7 @@ class Candidate:
     qpos: np.ndarray = field(repr=False)
     """Whole scene (nq,)."""
     moved_m: float
-    """Mean distance of the fingertips from where they were predicted."""
+    """Mean distance of the fingertips from their predicted positions."""
     quality: Quality
 
 
@@ -42,18 +42,18 @@ def propose(
     seed: int = 0,
     progress: StepProgress = silent,
 ) -> list[Candidate]:
-    """Sample hands for a scene's object and free them from penetration.
+    """Sample hand poses for a scene's object and free them from penetration.
 
     Args:
         predictor: predictor of the scene's hand.
         scene: scene of the task.
         objects: a state (nq,) with the objects in place.
-        count: how many candidates.
-        seed: seed of the samples.
+        count: number of candidates to return.
+        seed: seed of the samples and of the search that frees them.
         progress: called after each sample.
 
     Returns:
-        At most ``count``, most promising first; their quality lacks the lift rate.
+        At most ``count`` candidates, most promising first, as yet without a lift rate.
 
     Raises:
         ConfigError: the predictor is for another hand, or the object is attached to something.
@@ -72,7 +72,7 @@ def propose(
     frame = GraspFrame(scene, predictor.anchor_m)
     if len(predictor.mean) != frame.size:
         raise ConfigError(
-            f"the predictor of hand '{predictor.hand}' gives {len(predictor.mean)} numbers, task "
+            f"predictor of hand '{predictor.hand}' gives {len(predictor.mean)} numbers, but task "
             f"'{scene.task.id}' needs {frame.size}: train it again (pgdm pregrasp train)"
         )
     vectors = predictor.sample(object_code(scene, objects), OVERSAMPLING * count, seed)
@@ -86,13 +86,13 @@ def free_ones(
     seed: int = 0,
     progress: StepProgress = silent,
 ) -> list[Candidate]:
-    """Return vectors as candidates that touch nothing, most promising first.
+    """Return grasp vectors as candidates that touch nothing, most promising first.
 
-    Promising are those that had to move little and whose fingertips are near the object: the order
-    is that of ``moved_m`` plus ``quality.fingertip_distance_m``.
+    They are sorted by ``moved_m`` plus ``quality.fingertip_distance_m``. Vectors that cannot be
+    freed from penetration are left out.
 
     Raises:
-        SceneError: none could be freed.
+        SceneError: no vector could be freed.
     """
     scene, found = frame.scene, []
     for i, vector in enumerate(vectors):
@@ -111,10 +111,10 @@ def free_ones(
 
 
 def freed(scene: Scene, qpos: np.ndarray, seed: int = 0) -> np.ndarray | None:
-    """Return a state (nq,) near ``qpos`` in which the hand is free, or None if not found.
+    """Return a state (nq,) near ``qpos`` in which the hand is free, or None if none is found.
 
-    It keeps clear of everything but itself. Objects stay, joints keep their limits, and equal
-    arguments give an equal result.
+    The hand then keeps a clearance of 0.5 mm from everything but itself. Objects stay, joints
+    stay within their limits, and equal arguments give an equal result.
     """
     model, contact, start = scene.model, HandContact(scene), qpos.copy()
     count = scene.index.num_joints
@@ -133,13 +133,13 @@ def freed(scene: Scene, qpos: np.ndarray, seed: int = 0) -> np.ndarray | None:
 def ranked(
     candidates: Sequence[Candidate], lift: LiftTest, progress: StepProgress = silent
 ) -> list[Candidate]:
-    """Return candidates with their lift rates, best first; ties by distance of the fingertips.
+    """Return candidates with their lift rates, best first; ties go to the nearer fingertips.
 
-    Objects that cannot be lifted are ranked by that distance alone.
+    If the object cannot be lifted, only the fingertips' distance counts.
     """
     tested = []
     for i, one in enumerate(candidates):
-        # All joints have one degree of freedom: as many velocities as positions.
+        # All joints have one degree of freedom, so that nv = nq.
         rate = lift(Start(one.qpos, np.zeros_like(one.qpos), None))
         tested.append(replace(one, quality=replace(one.quality, lift_rate=rate)))
         progress("lift tests", i + 1, len(candidates))

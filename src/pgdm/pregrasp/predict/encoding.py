@@ -1,8 +1,8 @@
 """An object's shape as a vector: distances from a fixed set of points around it to its surface.
 
-The code of a surface S is c_i = min_{s in S} |b_i - s| / r for basis points b_i in a ball of radius
-r: a basis point set (Prokudin, Lassner, Romero, "Efficient Learning on Point Clouds with Basis
-Point Sets", ICCV 2019).
+The code of a surface S is c_i = min_{s in S} |b_i - s| / r, with the basis points b_i in a ball of
+radius r (Prokudin, Lassner, Romero, "Efficient Learning on Point Clouds with Basis Point Sets",
+ICCV 2019).
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from pgdm.sim.scene import Scene
 
 BASIS_POINTS = 256
 BASIS_RADIUS_M = 0.15
-"""Radius of the ball of basis points: the reach of a hand around an object's centre. It is fixed,
-since hands do not grow with objects."""
+"""Radius of the ball of basis points: how far a hand reaches around an object's centre. The same
+for all objects, because the hand's size is."""
 SURFACE_POINTS = 6000
 
-_INSIDE_M = 1e-4  # a point deeper in another part than this is not on the object's surface
-_LEAST_POINTS = 20  # of each part
+_INSIDE_M = 1e-4  # a point deeper than this in another part is not on the object's surface
+_LEAST_POINTS = 20  # sampled on each part
 
 
 @lru_cache(maxsize=1)
@@ -44,8 +44,8 @@ def encode(points: np.ndarray) -> np.ndarray:
     """Return the distance from each basis point to the nearest of an object's points, (B,).
 
     Args:
-        points: points of the object's surface (n, 3) m, relative to its centre of mass, world
-            axes: how an object lies decides how it can be grasped.
+        points: points of the object's surface (n, 3) m, relative to its centre of mass, in world
+            axes, because the possible grasps depend on how the object lies.
 
     Returns:
         Distances in units of :data:`BASIS_RADIUS_M`.
@@ -69,7 +69,7 @@ def surface_points(
 ) -> np.ndarray:
     """Return points on the collision surface of a body and of everything welded to it.
 
-    Surfaces of one part inside another are left out. Equal arguments give equal points.
+    Points of one part that lie inside another are left out. Equal arguments give equal points.
 
     Args:
         model: model of the scene.
@@ -81,7 +81,7 @@ def surface_points(
         Points (n, 3) m, world frame.
 
     Raises:
-        SceneError: the body has no collision geom, or one of a kind without a closed surface.
+        SceneError: the body has no collision geom, or one whose type has no closed surface.
     """
     welded = model.body_weldid == model.body_weldid[body]
     touchable = (model.geom_contype | model.geom_conaffinity) != 0
@@ -104,7 +104,7 @@ def surface_points(
 
 
 def _part(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> trimesh.Trimesh:
-    """Return a geom's collision surface in the world frame: that of a mesh is its convex hull."""
+    """Return a geom's collision surface in the world frame: for a mesh, its convex hull."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         first = model.mesh_vertadr[mesh]

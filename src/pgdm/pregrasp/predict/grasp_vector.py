@@ -1,13 +1,13 @@
-"""A hand's pose relative to an object as a grasp vector, and back to joints.
+"""Converts a hand's pose relative to an object to a grasp vector, and back to joints.
 
 The grasp vector of a hand with J joints after its base is (9 + J,); position and rotation are in
 world axes:
 
-- position of an anchor of the palm relative to the object's centre of mass, m (3); the predictor's
-  anchor is the mean over its examples of the fingertips' midpoint, in the palm's frame
+- position of the anchor, a point fixed to the palm, relative to the object's centre of mass, m (3);
+  a predictor's anchor is its examples' mean fingertip position in the palm's frame
 - first two columns of the palm's rotation (6), a representation without discontinuities (Zhou et
   al., "On the Continuity of Rotation Representations in Neural Networks", CVPR 2019)
-- joints after the base, rad (J)
+- positions of the joints after the base, rad (J)
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ POSITION, ROTATION, JOINTS = slice(0, 3), slice(3, 9), slice(9, None)
 
 
 def rotation_of(columns: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) of two approximate columns (6,), by Gram-Schmidt."""
+    """Return the rotation (3, 3) from its first two columns (6,), which Gram-Schmidt corrects."""
     first = unit(columns[:3])
     second = unit(columns[3:] - (first @ columns[3:]) * first)
     return np.stack((first, second, np.cross(first, second)), axis=1)
@@ -33,8 +33,8 @@ def rotation_of(columns: np.ndarray) -> np.ndarray:
 class GraspFrame:
     """Converts between the states of a scene and grasp vectors.
 
-    The base's joints are three slides, then three hinges about X, Y and Z in turn, all in the
-    mount's frame. The palm is the body that the wrist joints turn.
+    The base has three slides, then three intrinsic X-Y-Z hinges, all in the mount's frame. The palm
+    is the body that the last joint before the fingers moves.
 
     Args:
         scene: scene with hand and object.
@@ -53,7 +53,7 @@ class GraspFrame:
 
     @property
     def size(self) -> int:
-        """Length of a vector."""
+        """Length of a grasp vector, 9 + J."""
         return 9 + self._n - self._base
 
     def vector(self, qpos: np.ndarray) -> np.ndarray:
@@ -68,11 +68,11 @@ class GraspFrame:
     def qpos(self, vector: np.ndarray, objects: np.ndarray) -> np.ndarray:
         """Return the scene's state (nq,) with the hand at a grasp vector.
 
-        If the base would exceed its limits, base and wrist joints take the pose within them that
-        brings fingertips and palm nearest to the vector's, in least squares; the fingers stay.
+        If the base would exceed its limits, base and wrist joints within the limits are chosen that
+        minimise the squared error of the positions of fingertips and palm; the fingers stay.
 
         Args:
-            vector: (9+J,).
+            vector: grasp vector (9+J,).
             objects: a state (nq,) with the objects in place.
         """
         centre = self._at(objects).xipos[self.scene.index.object_body].copy()
@@ -96,16 +96,16 @@ class GraspFrame:
                 found.append(self._points(trial) - wanted)
             return np.stack(found, axis=1)
 
-        wanted = self._points(asked)  # kinematics ignores limits
+        wanted = self._points(asked)  # forward kinematics ignores joint limits
         bounds = [self._low[moving], self._high[moving]]
         best, _ = least_squares(hand[moving], away, bounds=bounds, verbose=0)
         asked[moving] = best.clip(*bounds)
         return asked
 
     def _base_joints(self, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """Return base joint positions (6,), not clipped.
+        """Return base joint positions (6,) that bring the mount body to a pose, not clipped.
 
-        Of the two Euler solutions it is the one that exceeds the limits less.
+        Of the two solutions for the Euler angles, the one that exceeds the limits less is used.
         """
         slides, hinges = base_joints(self.scene, position, rotation)
         hinges = np.remainder(hinges + np.pi, 2 * np.pi) - np.pi
@@ -114,32 +114,32 @@ class GraspFrame:
         return np.concatenate((slides, hinges[int(outside.argmin())]))
 
     def fingertips(self, qpos: np.ndarray) -> np.ndarray:
-        """Return the fingertips (F, 3) m at qpos (nq,), from the object's centre of mass."""
+        """Return the fingertips (F, 3) m at qpos (nq,), relative to the object's centre of mass."""
         data = self._at(qpos)
         return data.geom_xpos[self._tips] - data.xipos[self.scene.index.object_body]
 
     def fingertips_in_palm(self, joints: np.ndarray) -> np.ndarray:
-        """Return the fingertips (F, 3) m in the palm's frame, at the joints after the base (J,)."""
+        """Return the fingertips (F, 3) m in the palm's frame, given the joints after the base."""
         data = self._with(joints)
         palm = data.xmat[self._palm].reshape(3, 3)
         return (data.geom_xpos[self._tips] - data.xpos[self._palm]) @ palm
 
     def fingertips_of(self, vector: np.ndarray) -> np.ndarray:
-        """Return the fingertips (F, 3) m at a grasp vector, from the object's centre of mass.
+        """Return a grasp vector's fingertips (F, 3) m, relative to the object's centre of mass.
 
-        Unlike :meth:`qpos`, it ignores the base's limits.
+        Unlike in :meth:`qpos`, the base's limits are ignored.
         """
         rotation = rotation_of(vector[ROTATION])
         joints = vector[JOINTS].clip(self._low[self._base :], self._high[self._base :])
         return vector[POSITION] + (self.fingertips_in_palm(joints) - self.anchor_m) @ rotation.T
 
     def _points(self, qpos: np.ndarray) -> np.ndarray:
-        """Return positions of fingertips and palm at qpos (nq,), (3F+3,) m, world frame."""
+        """Return the positions of fingertips and palm (3F+3,) m, world frame, at qpos (nq,)."""
         data = self._at(qpos)
         return np.concatenate((data.geom_xpos[self._tips].ravel(), data.xpos[self._palm]))
 
     def _mount_in_palm(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pose of the mount's body in the palm's frame, (3,) m and (3, 3)."""
+        """Return the pose of the mount body in the palm's frame, (3,) m and (3, 3)."""
         data = self._with(joints)
         palm = data.xmat[self._palm].reshape(3, 3)
         return palm.T @ (self.scene.index.mount_pos - data.xpos[self._palm]), palm.T @ self._mount

@@ -1,4 +1,4 @@
-"""From a predictor to a start: candidates, the best one that can be reached, and its reach."""
+"""Predicts a start state: candidates, the best one that can be reached, and its reach plan."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from pgdm.pregrasp.reach.planner import plan_reach
 from pgdm.pregrasp.sources import reset_state
 from pgdm.sim.scene import Scene
 
-_TRIES = 3  # candidates to plan a reach for, before the best one is taken without
+_TRIES = 3  # most candidates to plan a reach for; if all plans fail, the best one is used anyway
 
 
 @dataclass(frozen=True)
 class PredictCfg:
-    """How a start is predicted."""
+    """Settings of a prediction."""
 
     samples: int = 8
     """Number of candidates that are lift-tested."""
     seed: int = 0
     """Seed of samples, lift test and reach plan."""
     reach: bool = True
-    """Whether to plan a reach."""
+    """Whether to plan the reach."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,11 @@ class Predicted:
     candidates: list[Candidate]
     """Best first."""
     chosen: int
-    """Index of the chosen one."""
+    """Index of the chosen candidate."""
     plan: ReachPlan | None
-    """Its reach, if one was found."""
+    """Reach plan that ends at the chosen candidate; None if no plan succeeded."""
     pregrasp: Pregrasp
-    """The chosen one, with its plan and a note of its origin."""
+    """The chosen candidate, with the final state of its plan and a note on its origin."""
 
 
 def predict(
@@ -56,21 +56,21 @@ def predict(
     progress: StepProgress,
     num_threads: int = 0,
 ) -> Predicted:
-    """Predict a pre-grasp; equal arguments give an equal one, whatever the number of threads.
+    """Predict a pre-grasp; equal arguments give an equal result, whatever the number of threads.
 
     Args:
         predictor: predictor of the scene's hand.
         scene: scene of the task.
         motion: motion of the task.
-        cfg: how.
+        cfg: settings of the prediction.
         notify: receives messages for the user.
         progress: receives the progress.
-        num_threads: 0 takes one per core.
+        num_threads: number of threads of the simulations; 0 takes one per core.
 
     Raises:
         ConfigError: the predictor is for another hand, the object is attached to something, or
             the motion does not store where objects start.
-        SceneError: no candidate can be freed from contact.
+        SceneError: no candidate can be freed from contact, or every planned reach diverges.
     """
     held_out = _is_held_out(predictor, scene, notify)
     objects = reset_state(motion, scene)
@@ -107,7 +107,7 @@ def predict(
 
 
 def _is_held_out(predictor: Predictor, scene: Scene, notify: Notify) -> bool:
-    """Return whether the predictor was fitted without the object, and tell the user."""
+    """Return whether the predictor was fitted without the scene's object, and tell the user."""
     name = object_of(scene)
     if name not in predictor.objects:
         notify(f"object '{name}' is held out: the predictor was trained without it")

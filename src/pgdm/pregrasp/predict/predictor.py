@@ -1,6 +1,6 @@
-"""A Gaussian over grasp vectors whose mean is linear in an object's code, and its fit.
+"""The predictor: a Gaussian over grasp vectors whose mean is linear in the object's code.
 
-Given an object's code c, the grasp vector is
+Given an object's code c (`encoding`), the grasp vector (`grasp_vector`) is distributed as
 
     v ~ N(m + (c - c_0) W, S)
 
@@ -9,9 +9,10 @@ codes and vectors minus these means, W is the ridge regression
 
     W = X^T (X X^T + penalty var(X) I)^-1 Y
 
-The penalty is the one with the least fingertip error on objects held out in turn, and S is 0.7^2
-times the second moment of the errors on these objects. With some 40 pre-grasps this predicts better
-than networks trained by gradient descent (``benchmark/predictor_networks.py``).
+Each object is held out in turn: the penalty is chosen for the least fingertip error on the held-out
+objects, and S is 0.7^2 times the second moment of the vectors' errors there. With some 40
+pre-grasps this predicts better than networks trained by gradient descent
+(``benchmark/predictor_networks.py``).
 """
 
 from __future__ import annotations
@@ -32,12 +33,14 @@ from pgdm.sim.scene import Scene
 PENALTIES = (0.3, 1.0, 3.0, 10.0, 30.0)
 """Ridge penalties to choose from, relative to the total variance of the codes."""
 SPREAD = 0.7
-"""Standard deviation of the samples relative to that of the held-out errors: with few candidates,
-the outer ones are rarely the best (best of 8 within 36 mm, with the full spread 38 mm)."""
+"""Standard deviation of the samples relative to that of the held-out errors. Less than 1, because
+among few candidates those far from the mean are rarely the best: the fingertip error of the best of
+8 is 36 mm, and 38 mm with 1."""
 LEAST_OBJECTS = 2
 _LEAST_VARIANCE = 0.5
-"""Lower bound of the codes' total variance; that of 32 objects is 3.4, of ten 0.9. Below it all
-objects have one shape, and small differences, such as how it was put down, must not count."""
+"""Lower bound of the codes' total variance in the ridge penalty. The variance of 32 objects is 3.4,
+of ten 0.9; if it is lower than 0.5, all objects have about the same shape, and small differences,
+such as how they lie, must have little effect."""
 
 
 @dataclass(frozen=True)
@@ -67,23 +70,23 @@ class Predictor:
     factor: np.ndarray = field(repr=False)  # (n, D), covariance = factor^T factor
     penalty: float
     tasks: tuple[str, ...]
-    """Tasks whose pre-grasps it was fitted on."""
+    """Tasks whose pre-grasps the predictor was fitted on."""
     objects: tuple[str, ...]
-    """Objects it was fitted on."""
+    """Objects that the predictor was fitted on."""
     left_out: tuple[str, ...]
-    """Objects that were left out."""
+    """Objects that the user left out of the fit."""
     error_m: float
     """Mean distance of the predicted fingertips from the stored ones, on objects held out in turn.
-    Slightly optimistic, since the penalty was chosen by it."""
+    Slightly optimistic, since the penalty was chosen to minimise it."""
     mean_hand_error_m: float
-    """The same for the mean vector of the other objects, whatever the shape."""
+    """The same error if the prediction is the other objects' mean vector, whatever the shape."""
 
     def expected(self, code: np.ndarray) -> np.ndarray:
         """Return the mean grasp vector (D,) for an object's code (B,)."""
         return self.mean + (code - self.code_mean) @ self.slope
 
     def sample(self, code: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
-        """Return grasp vectors (count, D): the mean, then random ones that depend on the seed."""
+        """Return grasp vectors (count, D): the mean, then random samples from ``seed``."""
         noise = torch.randn(
             (count, len(self.factor)), generator=torch_stream(seed, "predict"), dtype=torch.float64
         ).numpy()
@@ -92,9 +95,9 @@ class Predictor:
 
 
 def example(scene: Scene, qpos: np.ndarray) -> Example | None:
-    """Return a pre-grasp qpos (nq,) as an example, or None if the object does not lie free.
+    """Return a pre-grasp qpos (nq,) as an example, or None if the object is attached to something.
 
-    A hand has no choice where to grasp a door, and does not hold it near its centre.
+    A door, for instance, can only be grasped at its handle, far from its centre of mass.
     """
     if not scene.lies_free:
         return None
@@ -120,13 +123,13 @@ def fit(
 
     Args:
         examples: examples of one hand.
-        frame: frame of that hand, in any scene.
-        left_out: objects left out of the examples, for the record.
+        frame: grasp frame of that hand, in any scene.
+        left_out: objects that the examples leave out, stored in the predictor.
         progress: called after each penalty tried.
-        penalties: penalties to choose from; infinity gives the mean vector, whatever the object.
+        penalties: penalties to choose from; infinity predicts the mean vector for every object.
 
     Raises:
-        ConfigError: the examples are of too few objects.
+        ConfigError: the examples are from too few objects.
     """
     objects = sorted({e.object for e in examples})
     if len(objects) < LEAST_OBJECTS:
@@ -169,7 +172,7 @@ def fit(
 def _held_out(
     examples: Sequence[Example], codes: np.ndarray, vectors: np.ndarray, penalty: float
 ) -> np.ndarray:
-    """Return the grasp vectors (n, D) predicted for each object from those of the others."""
+    """Return each object's grasp vectors (n, D), predicted from the other objects' examples."""
     predicted = np.empty_like(vectors)
     for held, rest in folds(examples):
         predicted[held] = _Ridge(codes[rest], vectors[rest], penalty).at(codes[held])
@@ -177,32 +180,32 @@ def _held_out(
 
 
 def anchored(vector: np.ndarray, anchor: np.ndarray) -> np.ndarray:
-    """Return a grasp vector (9+J,) of the palm's origin with another anchor (3,) m instead."""
+    """Return a grasp vector (9+J,) with a new anchor (3,) m instead of the palm's origin."""
     moved = vector.copy()
     moved[POSITION] += rotation_of(vector[ROTATION]) @ anchor
     return moved
 
 
 def folds(examples: Sequence[Example]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield masks (n,) for each object: the examples of it, and the others."""
+    """Yield for each object two masks (n,): the object's examples, and all others."""
     names = np.array([e.object for e in examples])
     for name in sorted(set(names.tolist())):
         yield names == name, names != name
 
 
 def off(frame: GraspFrame, vector: np.ndarray, example: Example) -> float:
-    """Return the mean distance of a grasp vector's fingertips from an example's, m."""
+    """Return the mean distance between the fingertips of a grasp vector and an example, m."""
     away = frame.fingertips_of(vector) - example.fingertips
     return float(np.linalg.norm(away, axis=1).mean())
 
 
 class _Ridge:
-    """Ridge regression with an unpenalised offset; an infinite penalty gives the mean.
+    """Ridge regression with an unpenalised offset; an infinite penalty predicts the mean.
 
     Args:
-        codes: (n, B).
-        vectors: (n, D).
-        penalty: relative to the total variance of the codes.
+        codes: codes of the examples' objects (n, B).
+        vectors: grasp vectors of the examples (n, D).
+        penalty: ridge penalty, relative to the total variance of the codes.
     """
 
     def __init__(self, codes: np.ndarray, vectors: np.ndarray, penalty: float) -> None:
@@ -216,5 +219,5 @@ class _Ridge:
         self.slope = x.T @ np.linalg.solve(gram, y)
 
     def at(self, codes: np.ndarray) -> np.ndarray:
-        """Return the grasp vectors (m, D) at codes (m, B)."""
+        """Return the predicted grasp vectors (m, D) for codes (m, B)."""
         return self.mean + (codes - self.code_mean) @ self.slope

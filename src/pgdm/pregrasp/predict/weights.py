@@ -1,4 +1,4 @@
-"""A predictor's file: plain tensors, numbers and names; reading it never runs code from it."""
+"""The file of a predictor: tensors, numbers and names; reading it never runs code from it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pgdm.pregrasp.predict.encoding import BASIS_POINTS
 from pgdm.pregrasp.predict.predictor import Predictor
 
 FORMAT = "pgdm-predictor-1"
-"""Changes with the encoding and the grasp vectors."""
+"""Format of the file; to be changed whenever the encoding or the grasp vectors change."""
 
 _ARRAYS = ("anchor_m", "code_mean", "slope", "mean", "factor")
 _NUMBERS = ("penalty", "error_m", "mean_hand_error_m")
@@ -22,7 +22,7 @@ _NAMES = ("tasks", "objects", "left_out")
 
 
 def path_of(hand: str) -> Path:
-    """Return the path of the user's predictor of a hand, which may not exist."""
+    """Return the path of the user's predictor of a hand; the file may not exist."""
     return paths.inside(paths.user() / "predictors", hand, kind="hand", suffix=".pt")
 
 
@@ -46,8 +46,8 @@ def read(path: Path, hand: str) -> Predictor:
     """Read the predictor of a hand.
 
     Raises:
-        ConfigError: there is none, or it is for another hand.
-        CorruptAssetError: the file is damaged, or of another format.
+        ConfigError: the file is missing, or for another hand.
+        CorruptAssetError: the file is damaged, or has another format.
     """
     cure = f"train one with 'pgdm pregrasp train --hand {hand}'"
     if not path.is_file():

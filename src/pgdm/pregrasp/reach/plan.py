@@ -1,4 +1,4 @@
-"""A reach plan, and how far from its target it ends."""
+"""A reach plan, and how far from its pre-grasp it ends."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from pgdm.sim.scene import Scene
 BASE_TOLERANCE_M, JOINT_TOLERANCE_RAD = 0.01, 0.1
 OBJECT_TOLERANCE_M = 0.005
 TURN_TOLERANCE_RAD = 0.1
-"""Tolerance of the object's rotation. The search aims at it, but a plan may exceed it and still
-reach its target."""
+"""Tolerance of the object's rotation. The search tries to stay below it, but a plan that exceeds it
+may still count as reached."""
 DEPTH_TOLERANCE_M = 0.001
-"""MuJoCo's contacts are soft: fingers that only rest on something sink in by less than this."""
+"""Tolerance of penetration: fingers that only rest on something sink in by less, since MuJoCo's
+contacts are soft."""
 
 
 @dataclass(frozen=True)
 class ReachPlan:
-    """A plan and where it ends.
+    """A reach plan and where it ends.
 
-    Errors are measured from the target, or from the nearest pose within the hand's ranges.
+    The target is the pre-grasp. Errors are relative to the target, clipped to the hand's ranges.
     """
 
     actions: np.ndarray = field(repr=False)
     """(K, nu) in [-1, 1]."""
     state: Start = field(repr=False)
-    """State in which the plan ends in the simulation, with its actions."""
+    """State in which the plan ends in simulation, with the plan's actions."""
     base_error_m: float
     """Largest error of a slide of the base."""
     base_error_rad: float
@@ -41,30 +42,30 @@ class ReachPlan:
     finger_error_rad: float
     """Largest error of a joint after the base."""
     object_moved_m: float
-    """Distance of the object's centre of mass from where it is if the hand stays away."""
+    """Distance of the object's centre of mass from its position if the hand stays away."""
     object_turned_rad: float
-    """Angle between its orientation and the one it has if the hand stays away."""
+    """Angle between the object's orientation and that if the hand stays away."""
     depth_m: float
-    """Deepest penetration of the hand and anything else."""
+    """Deepest penetration between the hand and anything else at the end of the plan."""
     target_depth_m: float
-    """Deepest penetration of the target itself."""
+    """Deepest penetration between the hand and anything else at the target."""
     beyond_m: float
-    """Largest distance by which a slide of the target exceeds the hand's ranges."""
+    """Largest distance by which a slide of the target exceeds its range."""
     beyond_rad: float
-    """Largest angle by which another joint of the target exceeds the hand's ranges."""
+    """Largest angle by which any other joint of the target exceeds its range."""
     rounds: int = 0
-    """Rounds of the search; 0 if the plan was not searched."""
+    """Rounds of the search; 0 if the plan comes from elsewhere."""
     seconds: float = 0.0
-    """Time the search took."""
+    """Duration of the search, s."""
 
     @property
     def reached(self) -> bool:
-        """Whether the hand gets there, moves nothing and penetrates nothing."""
+        """Whether the hand reaches the target without moving the object or penetrating anything."""
         return not self.failures
 
     @property
     def failures(self) -> list[str]:
-        """What exceeds its tolerance, each with its value."""
+        """The errors that exceed their tolerances, in words, each with its value."""
         depth = max(self.target_depth_m, DEPTH_TOLERANCE_M)
         rows = (
             ("base", 1e3 * self.base_error_m, 1e3 * BASE_TOLERANCE_M, "mm off"),
@@ -76,7 +77,7 @@ class ReachPlan:
         return [f"{what} {off:.3g} {unit}" for what, off, most, unit in rows if not off <= most]
 
     def metrics(self) -> dict[str, Any]:
-        """Return the plan's metrics as plain JSON; without its time, so that equal plans give
+        """Return the plan's metrics as plain JSON; without ``seconds``, so that equal plans give
         equal files."""
         names = (
             *("base_error_m", "base_error_rad", "finger_error_rad", "object_moved_m"),
@@ -87,10 +88,10 @@ class ReachPlan:
 
 
 class Goal:
-    """The pre-grasp that a reach is to end at.
+    """The pre-grasp at which a reach should end.
 
     Args:
-        scene: scene of the task; its first joints are the hand's.
+        scene: scene of the task; the hand's n joints are first in qpos.
         target_qpos: whole scene (nq,) with the hand at its pre-grasp.
 
     Raises:
@@ -102,14 +103,14 @@ class Goal:
         target = np.asarray(target_qpos, float)
         if target.shape != (model.nq,) or not np.isfinite(target).all():
             raise SceneError(
-                f"a target of shape {target.shape} cannot be reached: the scene of task "
-                f"'{scene.task.id}' with hand '{scene.hand.name}' has {model.nq} finite positions"
+                f"a target of shape {target.shape} does not fit: the scene of task "
+                f"'{scene.task.id}' with hand '{scene.hand.name}' needs {model.nq} finite positions"
             )
         self.qpos, self._n, self._base = target, index.num_joints, index.num_base_joints
         low = np.maximum(model.jnt_range[: self._n, 0], index.joint_low)
         high = np.minimum(model.jnt_range[: self._n, 1], index.joint_high)
         self.joints = target[: self._n].clip(low, high)
-        """The hand's joints (n,), within the ranges of joints and servos."""
+        """Joint positions of the hand (n,), clipped to the ranges of joints and servos."""
         self.tolerance = np.full(self._n, JOINT_TOLERANCE_RAD)
         """Largest error allowed, (n,) m and rad."""
         self.tolerance[: min(3, self._base)] = BASE_TOLERANCE_M
@@ -119,7 +120,8 @@ class Goal:
     def shares(self, ends: Ends) -> np.ndarray:
         """Return errors divided by their tolerances, (N, 5).
 
-        The worst slide, hinge and finger joint, then how far the object has moved and turned.
+        These are the largest errors of slides, hinges and joints after the base, then the object's
+        displacement and rotation.
         """
         error = np.abs(ends.qpos[:, : self._n] - self.joints) / self.tolerance
         groups = [group.max(1, initial=0.0) for group in self._groups(error)]
@@ -127,7 +129,7 @@ class Goal:
         return np.stack((*groups, *objects), axis=1)
 
     def plan(self, actions: np.ndarray, ends: Ends, row: int) -> ReachPlan:
-        """Return a plan (K, nu) that ended as row ``row`` of ``ends``, with its errors."""
+        """Return the plan with actions (K, nu), whose final state is row ``row`` of ``ends``."""
         qpos, qvel = ends.qpos[row].copy(), ends.qvel[row].copy()
         errors = self._groups(np.abs(qpos[: self._n] - self.joints))
         beyond = self._groups(np.abs(self.qpos[: self._n] - self.joints))
@@ -148,7 +150,7 @@ class Goal:
         )
 
     def _groups(self, joints: np.ndarray) -> list[np.ndarray]:
-        """Return slides, hinges and the rest of joint positions (..., n)."""
+        """Split joint values (..., n) into those of slides, hinges and joints after the base."""
         slides = min(3, self._base)
         return np.split(joints, [slides, self._base], axis=-1)
 
@@ -156,7 +158,7 @@ class Goal:
 def measure(
     scene: Scene, plan_actions: np.ndarray, target_qpos: np.ndarray, substeps: int
 ) -> ReachPlan:
-    """Play a plan from elsewhere and measure it as the planner measures its own.
+    """Play a given plan, such as a published one, and measure it like the planner's own plans.
 
     Args:
         scene: scene of the task.

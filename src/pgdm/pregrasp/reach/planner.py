@@ -1,14 +1,14 @@
-"""The reach from the reset pose to a pre-grasp, planned on the simulator (paper, App. B).
+"""Plans the reach from the reset pose to a pre-grasp in simulation (paper, App. B).
 
-A cross-entropy search over the waypoints of a path, its timing and its final targets. A plan's cost
-comes from the final state and the object's largest displacement on the way; meshes are not used:
+A cross-entropy search over the waypoints of a path, its timing and its final targets. The cost of a
+plan uses only the final state and the object's largest displacement on the way:
 
     cost = sum_i e_i + sqrt(mean_j r_j^2) + peak / 5 mm + 0.05 s mean_j |qdot_j| / tol_j
 
 with e_i the errors of :meth:`pgdm.pregrasp.reach.plan.Goal.shares`, each divided by its tolerance,
-r_j the error of joint j divided by its tolerance tol_j, and peak the largest distance by which the
-object was moved. After each round the final targets also move by the error that remains,
-since servos lag behind their targets.
+r_j the error of joint j divided by its tolerance tol_j, qdot_j its final velocity, and peak the
+object's largest displacement. After each round the mean of the final targets is also shifted by a
+share of the remaining error, because servos do not fully reach their targets.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from pgdm.pregrasp.sources import reset_pose
 from pgdm.sim.scene import Scene
 
 STEPS, SLOW_STEPS, SLOW_S = 40, 60, 0.3
-"""Control steps of a released plan; the same for bases with slow servos (D'Manus); servo lag [s]
-above which a base counts as slow."""
+"""Length of the released plans in control steps; their length for bases with slow servos (D'Manus);
+servo lag, s, above which a base counts as slow."""
 
 _END_STD = 0.003, 0.02, 0.03
-"""Standard deviation of the final targets in the first round: slides m, hinges and fingers rad."""
+"""First standard deviation of final targets: slides m, hinges rad, joints after the base rad."""
 _END_LIMIT = 5.0  # largest distance of the final targets from the goal, in tolerances
-_SETTLE_GAIN = 0.6  # of the integrator that finds the servos' offsets in the air
-_SHIFT = 0.7  # largest shift of the pose aimed at where servos cannot remove an error (tolerances)
+_SETTLE_GAIN = 0.6  # of the integrator that finds the servos' steady-state offsets without contact
+_SHIFT = 0.7  # largest shift of the goal where servos cannot remove an error, in tolerances
 _SLACK = 0.4  # error that is not corrected, in tolerances
-_SPEED_WEIGHT_S = 0.05  # of the joints' mean final speed, in tolerances per second
-_CHECKED = 4  # candidates of a round that are checked for penetration
-_IMPROVED = 0.9  # a round improves if its best cost is below this share of the best so far
+_SPEED_WEIGHT_S = 0.05  # weight of the joints' mean final speed, in tolerances per second
+_CHECKED = 4  # best candidates of a round that are checked for penetration
+_IMPROVED = 0.9  # a round improves the search if it lowers the best cost to below this share
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class ReachCfg:
     """Settings of the search for a reach."""
 
     steps: int | None
-    """Control steps of the plan; None takes 40, or 60 for slow base servos (released code)."""
+    """Control steps of the plan; None means 40, or 60 for slow base servos (released plans)."""
     hold_steps: int
-    """Control steps at the end of the plan in which the final target stays."""
+    """Control steps at the end of the plan in which the final targets are held."""
     cem: CemCfg
-    """How candidates follow the best ones."""
+    """Settings of the cross-entropy method."""
     rounds: int
     """Largest number of rounds."""
     correction: float
@@ -60,13 +60,14 @@ class ReachCfg:
     margin: float
     """The search stops once every error is below this share of its tolerance (0..1)."""
     patience: int
-    """It also stops once the plan reaches the pre-grasp and so many rounds have not improved it."""
+    """The search also stops after this many rounds without improvement, if the pre-grasp is
+    reached."""
 
     def check(self) -> None:
         """Check that the plan has time to move, and that there are fewer elites than candidates.
 
         Raises:
-            ConfigError: it does not.
+            ConfigError: ``steps`` or ``cem.elites`` has a wrong value.
         """
         if self.steps is not None and self.steps <= self.hold_steps:
             raise ConfigError(
@@ -76,7 +77,7 @@ class ReachCfg:
         if not 1 <= self.cem.elites < self.cem.population:
             raise ConfigError(
                 f"a search with {self.cem.elites} elites of {self.cem.population} candidates "
-                "learns nothing; take at least 1, and fewer than candidates"
+                "learns nothing; take at least one elite, and fewer elites than candidates"
             )
 
 
@@ -101,14 +102,15 @@ def plan_reach(
         scene: scene of the task.
         target_qpos: whole scene (nq,) with the hand at its pre-grasp.
         substeps: physics steps per control step.
-        cfg: how to search.
+        cfg: settings of the search.
         seed: seed of the search.
-        num_threads: 0 takes one per core.
-        progress: called before and after each round, with the most rounds as the total.
+        num_threads: number of threads of the simulations; 0 takes one per core.
+        progress: called at the start and after each round; its total is the largest number of
+            rounds.
 
     Raises:
         SceneError: the target does not fit the scene, or every simulation diverges.
-        ConfigError: the plan has no time to move, or the search no elites.
+        ConfigError: ``cfg`` has a wrong value, see :meth:`ReachCfg.check`.
     """
     began = time.monotonic()
     search = _Search(scene, np.asarray(target_qpos, float), substeps, cfg, seed, num_threads)
@@ -123,7 +125,7 @@ def plan_reach(
 
 
 def default_steps(scene: Scene) -> int:
-    """Return the length that the released plans have for the scene's hand, in control steps."""
+    """Return the length of the released plans for the scene's hand, in control steps."""
     model, n = scene.model, scene.index.num_base_joints
     lag = model.dof_damping[:n] / model.actuator_gainprm[scene.index.actuators[:n], 0]
     return SLOW_STEPS if n and lag.max() > SLOW_S else STEPS
@@ -139,7 +141,10 @@ class _Candidate:
     worst: float  # largest error, in tolerances
 
     def beats(self, other: _Candidate | None, margin: float) -> bool:
-        """Return whether this one is better: first by reaching the goal, then margin, then cost."""
+        """Return whether this candidate is better than another, or there is no other.
+
+        A candidate that reaches the goal wins, then one within the margin, then the lower cost.
+        """
         return other is None or self._rank(margin) < other._rank(margin)
 
     def _rank(self, margin: float) -> tuple[bool, bool, float]:
@@ -175,7 +180,7 @@ class _Search:
         aim, extra = self._rollouts.settled(above, nearest, farthest, _SETTLE_GAIN)
         shift, limit = (aim - above)[base:], _END_LIMIT * tolerance
         mean[self._paths.layout.ends][base:] = shift + extra.clip(-limit, limit)[base:]
-        # Errors that servos cannot remove are not corrected again.
+        # Where the goal was shifted, errors up to that shift are not corrected again.
         self._slack = nearest
         self._slack[base:] = np.where(shift != 0, farthest[base:], nearest[base:])
         self._cem = CrossEntropy(mean, std, cfg.cem, seeding.numpy_stream(seed, "reach"))
@@ -212,7 +217,7 @@ class _Search:
         for row in elites[:_CHECKED].tolist():
             plan = self._goal.plan(actions[row], ends, row)
             depth = plan.depth_m / max(plan.target_depth_m, DEPTH_TOLERANCE_M)
-            # Turning is penalised by the cost alone: a sphere may turn on the spot.
+            # The object's rotation counts in the cost only: a sphere may turn on the spot.
             worst = max(float(shares[row, :-1].max()), depth)
             one = _Candidate(vectors[row], plan, float(cost[row]), worst)
             self._best = one if one.beats(self._best, cfg.margin) else self._best
@@ -222,7 +227,7 @@ class _Search:
         return best.worst <= cfg.margin or (best.plan.reached and self._idle >= cfg.patience)
 
     def _cost(self, shares: np.ndarray, ends: Ends) -> np.ndarray:
-        """Return the cost of plans, (N,), infinite where the simulation diverged."""
+        """Return the costs of plans (N,), infinite where the simulation diverged."""
         goal, n = self._goal, len(self._goal.joints)
         error = (ends.qpos[:, :n] - goal.joints) / goal.tolerance
         speed = np.abs(ends.qvel[:, :n]) / goal.tolerance
@@ -230,7 +235,10 @@ class _Search:
         return np.where(ends.diverged, np.inf, cost + _SPEED_WEIGHT_S * speed.mean(1))
 
     def _correct(self, qpos: np.ndarray) -> None:
-        """Move the mean of the final targets by the elites' (E, nq) mean error, less the slack."""
+        """Shift the mean of the final targets by a share of the elites' mean error, less the slack.
+
+        ``qpos`` are the final states of the elites (E, nq).
+        """
         if not len(qpos):
             return
         goal, tolerance = self._goal.joints, self._goal.tolerance

@@ -1,4 +1,4 @@
-"""Reach plans played in the simulation, many in parallel."""
+"""Plays reach plans in simulation, many in parallel."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pgdm.sim.scene import Scene, SceneIndex
 
 @dataclass(frozen=True)
 class Ends:
-    """States in which N plans end."""
+    """Final states of N plans; the object's are relative to its motion if the hand stays away."""
 
     qpos: np.ndarray  # (N, nq) m, rad
     qvel: np.ndarray  # (N, nv) m/s, rad/s
-    moved_m: np.ndarray  # (N,) distance of the object's centre of mass from the undisturbed one
-    turned_rad: np.ndarray  # (N,) angle between its orientation and the undisturbed one
-    peak_m: np.ndarray  # (N,) largest such distance during the plan
+    moved_m: np.ndarray  # (N,) displacement of the object's centre of mass
+    turned_rad: np.ndarray  # (N,) rotation of the object
+    peak_m: np.ndarray  # (N,) largest displacement of its centre of mass during the plan
     diverged: np.ndarray  # (N,) bool
 
 
@@ -27,8 +27,8 @@ class Ends:
 class ObjectTrack:
     """Pose of the object after each of K control steps."""
 
-    pos: np.ndarray  # (K, 3) m, of its centre of mass
-    quat: np.ndarray  # (K, 4) wxyz
+    pos: np.ndarray  # (K, 3) m, position of the object's centre of mass, world frame
+    quat: np.ndarray  # (K, 4) wxyz, orientation of the object's body
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class Played:
 
 
 def to_targets(index: SceneIndex, actions: np.ndarray) -> np.ndarray:
-    """Return actuator targets (..., nu), m and rad, of actions in [-1, 1]."""
+    """Return the actuator targets (..., nu), m and rad, of actions (..., nu) in [-1, 1]."""
     middle, half = _control_range(index)
     return middle + np.clip(actions, -1.0, 1.0) * half
 
 
 def to_actions(index: SceneIndex, targets: np.ndarray) -> np.ndarray:
-    """Return the actions (..., nu) in [-1, 1] whose targets are nearest to joints (..., n)."""
+    """Return the actions (..., nu) in [-1, 1] for target joint positions (..., n), clipped."""
     middle, half = _control_range(index)
     return ((targets[..., index.driven] - middle) / half).clip(-1.0, 1.0)
 
@@ -57,12 +57,13 @@ def _control_range(index: SceneIndex) -> tuple[np.ndarray, np.ndarray]:
 
 
 def play(scene: Scene, plan_actions: np.ndarray, start_qpos: np.ndarray, substeps: int) -> Played:
-    """Play a plan in the simulation.
+    """Play a plan in simulation.
 
     Args:
         scene: scene of the task.
         plan_actions: (K, nu) in [-1, 1].
-        start_qpos: whole scene (nq,), see :func:`pgdm.pregrasp.sources.reset_pose`.
+        start_qpos: start of the plan, whole scene (nq,): see
+            :func:`pgdm.pregrasp.sources.reset_pose`.
         substeps: physics steps per control step.
 
     Raises:
@@ -84,7 +85,7 @@ def check_plan(scene: Scene, plan_actions: np.ndarray) -> None:
     """Check that a plan (K, nu) fits the scene's hand.
 
     Raises:
-        ConfigError: it does not.
+        ConfigError: the plan is for another hand.
     """
     if plan_actions.ndim != 2 or plan_actions.shape[1] != scene.model.nu:
         raise ConfigError(
@@ -94,14 +95,14 @@ def check_plan(scene: Scene, plan_actions: np.ndarray) -> None:
 
 
 class Rollouts:
-    """Plays N plans in parallel, all from one start.
+    """Plays N plans in parallel, all from the same start.
 
     Args:
         scene: scene of the task.
-        start_qpos: whole scene (nq,).
-        num_plans: N.
+        start_qpos: start of the plans, whole scene (nq,).
+        num_plans: number of plans, N.
         substeps: physics steps per control step.
-        num_threads: 0 takes one per core; results do not depend on it.
+        num_threads: number of threads; 0 takes one per core. Results do not depend on it.
     """
 
     def __init__(
@@ -113,7 +114,7 @@ class Rollouts:
         self._substeps, self.control_dt_s = substeps, self._sim.control_dt_s
 
     def undisturbed(self, steps: int) -> ObjectTrack:
-        """Return the object's track while the hand stays in its reset pose."""
+        """Return the object's track over ``steps`` while the hand stays in its reset pose."""
         sim = SimBatch(self._scene, 1, 1, self._substeps)
         sim.reset(np.array([0]), self._start, np.zeros(self._scene.model.nv))
         index = self._scene.index
@@ -129,22 +130,23 @@ class Rollouts:
     def settled(
         self, joints: np.ndarray, nearest: np.ndarray, farthest: np.ndarray, gain: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return where servos can come to rest near joints, and their targets' offsets from there.
+        """Return joint positions near ``joints`` where servos can come to rest, and target offsets.
 
-        The servos hold the joints for a second. An error above ``nearest`` then is one they cannot
-        remove, such as that of joints coupled by a tendon: the aim shifts by it, at most by
-        ``farthest``. For another second an integrator finds the offsets that remove the rest:
+        First the targets are held at ``joints`` for a second. A servo cannot remove an error that
+        then still exceeds ``nearest``, such as that of joints coupled by a tendon: the aim is
+        shifted by this error, at most by ``farthest``. For another second an integrator finds the
+        offsets between targets and aim that remove the remaining error:
 
             extra <- extra + gain (aim - q)
 
         Args:
-            joints: where the hand should be, (n,) m and rad.
-            nearest: error up to which the aim stays, (n,).
+            joints: desired joint positions (n,) m and rad.
+            nearest: largest error that does not shift the aim, (n,).
             farthest: largest shift of the aim, (n,).
-            gain: share of the error that a control step adds to the offsets.
+            gain: share of the error that each control step adds to the offsets.
 
         Returns:
-            Aim and offsets, (n,) each.
+            Aim and offsets, (n,) each; ``joints`` and zeros if the simulation diverges.
         """
         index, n = self._scene.index, len(joints)
         sim, steps = SimBatch(self._scene, 1, 1, self._substeps), round(1 / self.control_dt_s)
@@ -158,13 +160,18 @@ class Rollouts:
                 off = rest - joints
                 aim += np.where(np.abs(off) > nearest, off.clip(-farthest, farthest), 0.0)
             if k >= steps:
-                # Anti-windup: targets beyond the control range have no effect.
+                # Anti-windup: keep targets within the control range, beyond which they are clipped.
                 extra += gain * (aim - rest)
                 extra = extra.clip(index.joint_low - aim, index.joint_high - aim)
         return aim, extra
 
     def run(self, actions: np.ndarray, undisturbed: ObjectTrack) -> Ends:
-        """Return where plans (N, K, nu) end; the object is compared with its undisturbed track."""
+        """Return the final states of plans with actions (N, K, nu).
+
+        Args:
+            actions: (N, K, nu) in [-1, 1].
+            undisturbed: the object's track if the hand stays away, for comparison.
+        """
         sim, n = self._sim, len(self._all)
         sim.reset(self._all, self._start, np.zeros(self._scene.model.nv))
         targets = to_targets(self._scene.index, actions)

@@ -1,4 +1,4 @@
-"""Pre-grasps to reach and the plans that end there: those stored, and storing one's own."""
+"""Finds stored pre-grasps and published reach plans, and stores new plans."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ TARGETS = ("mined", *(source for source in pregrasp_file.SOURCES if source != "p
 
 
 def pose_of(source: str, motion: Motion, scene: Scene) -> np.ndarray:
-    """Return a source's pre-grasp itself, not the end of a reach: whole scene (nq,).
+    """Return the pre-grasp of a source, not the state in which a reach ends: whole scene (nq,).
 
-    The user's own takes precedence over one stored with the motion.
+    The user's own pre-grasp takes precedence over the one stored with the motion.
 
     Raises:
-        ConfigError: there is none for this task and hand.
+        ConfigError: no pre-grasp of this source is stored for the task and hand.
     """
     task, hand, nq = scene.task.id, scene.hand.name, scene.model.nq
     own = pregrasp_file.find(task, hand, source) if source in pregrasp_file.SOURCES else None
@@ -48,7 +48,7 @@ def pose_of(source: str, motion: Motion, scene: Scene) -> np.ndarray:
 
 
 def published(motion: Motion, scene: Scene) -> Start | None:
-    """Return the plan stored with the motion, or None if it has none for this hand."""
+    """Return the final state and actions of the motion's reach plan; None if none fits the hand."""
     start = motion.starts.get("planned")
     if start is None or start.actions is None or start.qpos.shape != (scene.model.nq,):
         return None
@@ -62,20 +62,20 @@ def store(
     plan: ReachPlan,
     note: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write a plan to the user's own pre-grasps, and return the file.
+    """Store a reach plan in the user's folder, and return the path of the file.
 
-    A plan to the mined pre-grasp becomes the user's ``planned``; one to a pre-grasp of the user's
-    own is added to that pre-grasp's file.
+    A plan to the mined pre-grasp is stored as the user's ``planned`` pre-grasp; a plan to one of
+    the user's own pre-grasps is added to the file of that pre-grasp.
 
     Args:
         scene: scene of the task.
-        source: source of the pre-grasp, of :data:`TARGETS`.
+        source: source of the pre-grasp, one of :data:`TARGETS`.
         target: whole scene (nq,) with the hand at its pre-grasp.
-        plan: that ends there.
+        plan: the plan to this pre-grasp.
         note: further entries of the file's note, plain JSON.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     task, hand = scene.task.id, scene.hand.name
     name = "planned" if source == "mined" else source

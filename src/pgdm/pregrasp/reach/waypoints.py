@@ -1,17 +1,17 @@
-"""The reach as a path through three waypoints, encoded in a vector that a planner can search.
+"""The reach as a path through three waypoints, encoded in a vector that the planner can search.
 
 From the reset pose q_0 the hand goes to q_1 above the object, to q_2 at a standoff from the
-pre-grasp, and to q_3, the pre-grasp plus a searched offset; there the thumb closes first, then the
-other fingers. With s(x) = 10 x^3 - 15 x^4 + 6 x^5, clipped to 0..1, and joint j moving from
-waypoint k - 1 to k between the times b_jk and e_jk, the path is
+pre-grasp, and to q_3, the pre-grasp plus an offset; there the thumb closes first, then the other
+fingers. With s(x) = 10 x^3 - 15 x^4 + 6 x^5, x clipped to 0..1, and joint j moving from waypoint
+k - 1 to k between the times b_jk and e_jk, the path is
 
     q_j(t) = q_0j + sum_k s((t - b_jk) / (e_jk - b_jk)) (q_kj - q_{k-1}j)
 
-and the actuator targets lead it by what a servo with damping D, gain k_p and inertia M lags behind:
+The actuator targets compensate the lag of a servo with damping d, gain k_p and inertia M:
 
     u = q + d/k_p qdot + M/k_p qddot
 
-Only the hand's kinematics and servos, and the object's centre of mass, are used.
+Only the hand's kinematics and servos, and the object's centre of mass, are used; contacts are not.
 """
 
 from __future__ import annotations
@@ -28,36 +28,36 @@ from pgdm.sim.scene import Scene
 ABOVE_M = 0.3
 """Height of the first waypoint above the pre-grasp (paper, App. B)."""
 STANDOFF_M = 0.08
-"""Distance of the standoff from the pre-grasp, in the first round's mean."""
-_OPEN_SHARE, _THUMB_SHARE = 0.6, 0.3  # how far fingers and thumb are open there (1: straight)
-# Shares of the plan's time: above, down to the standoff, to the pre-grasp, thumb, other fingers.
+"""Distance of the second waypoint from the pre-grasp, in the first round's mean."""
+_OPEN_SHARE, _THUMB_SHARE = 0.6, 0.3  # first means of `Layout.openness`: fingers, thumb
+# Shares of the plan's time: to q_1, to q_2, base to q_3, thumb to q_3, other fingers to q_3.
 _DURATIONS = np.array([0.25, 0.25, 0.2, 0.12, 0.18])
 _ABOVE_STD, _STANDOFF_STD = (0.05, 0.2), (0.04, 0.15)  # m, rad
-_SHARE_STD, _DURATION_STD = 0.3, 0.3
+_SHARE_STD, _DURATION_STD = 0.3, 0.3  # of openness and of the durations' logarithms
 
 
 @dataclass(frozen=True)
 class Layout:
     """Slices of a candidate's vector."""
 
-    above: slice  # slides m, then hinges rad, relative to the goal
-    standoff: slice  # likewise
-    openness: slice  # (F,) of each finger at waypoints 1 and 2; 1 is straight
-    durations: slice  # (5,) logarithms
-    ends: slice  # (n,) offset of the final target from the goal, m and rad
+    above: slice  # base joints at waypoint 1, relative to waypoint 3: slides m, then hinges rad
+    standoff: slice  # base joints at waypoint 2, likewise
+    openness: slice  # (F,) of each finger at waypoints 1 and 2: 0 as in waypoint 3, 1 as in q_0
+    durations: slice  # (5,) logarithms of the relative durations, see `_DURATIONS`
+    ends: slice  # (n,) offset of the final target (waypoint 3) from the goal, m and rad
     size: int
 
 
 class Waypoints:
-    """Turns candidates into actuator targets.
+    """Turns the planner's candidate vectors into actuator targets.
 
     Args:
-        scene: its first joints are the hand's.
+        scene: scene of the task; the hand's n joints are first in qpos.
         goal: joints (n,) of the pre-grasp, within the hand's ranges.
         qpos: whole scene (nq,) with the hand at its pre-grasp.
         steps: control steps of the plan, K.
-        hold: control steps at the end in which the final target stays.
-        dt_s: time of a control step.
+        hold: control steps at the end in which the final targets are held.
+        dt_s: duration of a control step, s.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Waypoints:
         self._inertia = model.dof_M0[: self._n] / kp  # s2
         self._home = index.reset.clip(self._low, self._high)
         mount = mount_rotation(scene)
-        # Unit directions (3,) of the slides: up, and from the object to the hand.
+        # Unit vectors (3,) in the slides' coordinates: up, and from the object to the hand.
         self._up = np.array([0.0, 0.0, 1.0]) @ mount
         self._away = unit(object_to_hand(scene, qpos)) @ mount
         self.layout = self._make_layout()
@@ -93,8 +93,8 @@ class Waypoints:
         """Return mean and standard deviation of the first candidates, (D,) each.
 
         Args:
-            end_std: standard deviations of the final targets' offsets (slides m, hinges and fingers
-                rad).
+            end_std: standard deviations of the final targets' offsets: slides m, hinges rad, joints
+                after the base rad.
         """
         layout, base = self.layout, self._base
         mean, std = np.zeros(layout.size), np.zeros(layout.size)
@@ -114,21 +114,21 @@ class Waypoints:
 
     @property
     def above(self) -> np.ndarray:
-        """Joints (n,) of the hand :data:`ABOVE_M` above its pre-grasp, or as far up as it goes."""
+        """Joints (n,) with the hand :data:`ABOVE_M` above its pre-grasp, clipped to its ranges."""
         joints = self._goal.copy()
         joints[:3] += ABOVE_M * self._up
         return joints.clip(self._low, self._high)
 
     def targets(self, candidates: np.ndarray) -> np.ndarray:
-        """Return where the joints should go, (N, K, n), of candidates (N, D), m and rad."""
+        """Return the target joint positions (N, K, n), m and rad, of candidates (N, D)."""
         n, shares = len(candidates), np.exp(candidates[:, self.layout.durations])
         ends = np.cumsum(shares, 1) / shares.sum(1, keepdims=True) * self._moving  # (N, 5) steps
         begins = np.concatenate((np.zeros((n, 1)), ends[:, :-1]), 1)
         knots = self._knots(candidates)
-        # The middle of each control step, and one more at both ends for the derivatives.
+        # The middle of each control step, plus one more at each end for the derivatives.
         t = np.arange(self._steps + 2)[:, None] - 0.5
         path = np.repeat(knots[0][:, None], len(t), 1)
-        last = np.full(self._n, 2)  # stage in which each joint comes to the last waypoint
+        last = np.full(self._n, 2)  # index in durations of each joint's move to the last waypoint
         last[self._fingers] = np.where(self._finger_of_joint == self._thumb, 3, 4)
         for k, stage in ((1, 0), (2, 1), (3, last)):
             begin = np.broadcast_to(begins[:, stage].reshape(n, -1), (n, self._n))[:, None]
@@ -159,5 +159,5 @@ def _per_joint(base: int, slides: float, hinges: float) -> np.ndarray:
 
 
 def _smooth(share: np.ndarray) -> np.ndarray:
-    """Return 10 x^3 - 15 x^4 + 6 x^5: from 0 to 1, without speed or acceleration at the ends."""
+    """Return 10 x^3 - 15 x^4 + 6 x^5, with zero velocity and acceleration at x = 0 and 1."""
     return share**3 * (10 - 15 * share + 6 * share**2)

@@ -1,1 +1,1 @@
-"""From a human hand's motion to the pre-grasp of a robot hand."""
+"""Retargeting: the pre-grasp of a robot hand from recorded joints of a human hand."""

@@ -4,8 +4,9 @@ Each step solves a quadratic program for a change dq of the joints, within their
 
     min  sum_p w_p^2 |x_p + J_p dq - x*_p|^2 + w_R^2 |theta|^2 + w_h^2 |q_f + dq_f - mean_f|^2
 
-over the hand's points x_p with Jacobians J_p and targets x*_p, the palm's rotation error theta, and
-the finger joints q_f, pulled weakly towards the hand's mean pre-grasp, plus damping.
+plus damping. Here x_p are the hand's tracked points, J_p their Jacobians and x*_p their targets,
+theta is the palm's rotation error after the step, and q_f are the finger joints, which the last
+term pulls weakly towards the hand's mean pre-grasp, mean_f.
 """
 
 from __future__ import annotations
@@ -24,54 +25,54 @@ from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
 
 REACHED_M = 0.02
-"""A fingertip farther from its target than this counts as out of reach."""
+"""A fingertip counts as out of reach if it is farther from its target than this."""
 AT_LIMIT = 1e-3
-"""A joint closer to a limit than this counts as at the limit, m or rad."""
+"""A joint counts as at a limit if it is closer to the limit than this, m or rad."""
 CLEARANCE_M = 0.001
 """Distance that obstacle avoidance keeps between the hand and everything else."""
 
 _SOLVER = "daqp"
-_STEPS, _SETTLED = 200, 1e-5  # most steps, and largest joint change at which it has converged
+_STEPS, _SETTLED = 200, 1e-5  # most steps; converged if all joints change by less, m or rad
 _DAMPING = 1e-6
-_MEAN_WEIGHT = 0.006  # per rad, against 1 per m of the points, which leave some joints free
-_FAR_M = 0.02  # distance from which on an obstacle is considered
+_MEAN_WEIGHT = 0.006  # per rad; small, since it should only fix joints that the points leave free
+_FAR_M = 0.02  # obstacles farther from the hand than this are ignored
 _LARGEST_STEP = 0.15  # of a joint in one step, m or rad: the Jacobian is only local
-_DEPTH_COST = 20.0  # m of fingertip error that a metre of penetration counts as
+_DEPTH_COST = 20.0  # cost of penetration relative to that of fingertip errors
 
 
 @dataclass(frozen=True)
 class IkResult:
-    """A hand brought to its targets."""
+    """A pose found by inverse kinematics, with its errors."""
 
     qpos: np.ndarray = field(repr=False)
     """Whole scene (nq,): the hand's joints, then the objects' as they were."""
     fingertip_errors_m: np.ndarray
     """Distance of each fingertip from its target (F,)."""
     palm_error_rad: float
-    """Angle between the palm and its target."""
+    """Angle between the palm's orientation and its target."""
     points_error_m: float
-    """Mean distance of the hand's points from their targets, weighted by the targets' weights."""
+    """Mean distance of the hand's points from their targets, weighted by ``targets.weights``."""
     depth_m: float
-    """Deepest penetration of the hand and anything else."""
+    """Deepest penetration between the hand and anything else."""
     at_limit: tuple[str, ...]
-    """Joints at one of their limits."""
+    """Names of the joints that are at a limit."""
     targets: Targets = field(repr=False)
-    """The targets."""
+    """The targets that the errors refer to."""
 
     @property
     def unreached(self) -> np.ndarray:
-        """Numbers of the fingertips that are out of reach."""
+        """Indices of the fingertips that are out of reach."""
         return np.flatnonzero(self.fingertip_errors_m > REACHED_M)
 
     @property
     def cost(self) -> float:
-        """Errors plus weighted penetration, m; for choosing between results."""
+        """Weighted sum of errors and penetration, m; the result of least cost is chosen."""
         worst = float(self.fingertip_errors_m.max())
         return self.points_error_m + 0.2 * worst + _DEPTH_COST * self.depth_m
 
 
 class _Points(mink.Task):
-    """Brings the hand's points to their targets, each with its own weight."""
+    """IK task: brings the hand's points to their targets, each with its own weight."""
 
     def __init__(self, scene: Scene, targets: Targets) -> None:
         super().__init__(np.repeat(targets.weights, 3), lm_damping=1e-4)
@@ -91,14 +92,14 @@ class _Points(mink.Task):
 
 
 class _Coupled(mink.Task):
-    """Keeps coupled joints where their leaders put them; a constraint."""
+    """IK constraint: keeps coupled joints at the positions that their leaders determine."""
 
     def __init__(self, scene: Scene) -> None:
         self._couplings = scene.index.couplings
         super().__init__(np.ones(len(self._couplings.rows)))
 
     def compute_error(self, configuration: mink.Configuration) -> np.ndarray:
-        """Return how far followers are from where they belong (C,) rad."""
+        """Return the deviations of the coupled joints from their determined positions (C,) rad."""
         q, couplings = configuration.q, self._couplings
         return q[couplings.followers] - couplings.of(q[couplings.leaders])
 
@@ -112,7 +113,7 @@ class _Coupled(mink.Task):
 
 
 class HandIk:
-    """Inverse kinematics of one scene, set up once; a step takes a few milliseconds.
+    """Inverse kinematics of the hand in one scene; a step takes a few milliseconds.
 
     Args:
         scene: scene with hand, table and objects.
@@ -132,13 +133,13 @@ class HandIk:
     def track(
         self, targets: Targets, start: np.ndarray, steps: int = _STEPS, avoid: bool = False
     ) -> np.ndarray:
-        """Return joint positions (nq,) near the targets, within the joints' limits.
+        """Return the scene (nq,) with the hand near its targets, within the joints' limits.
 
         Args:
-            targets: what to reach.
-            start: whole scene (nq,) to begin at.
+            targets: targets of the hand's points.
+            start: whole scene (nq,) to start from.
             steps: largest number of steps.
-            avoid: whether object and table are obstacles; existing penetration then gets no deeper.
+            avoid: whether to avoid object and table; existing penetration then gets no deeper.
         """
         model, n = self.scene.model, self.scene.index.num_joints
         low, high = model.jnt_range[:n].T
@@ -158,7 +159,7 @@ class HandIk:
                     limits=limits, constraints=self._constraints,
                 )  # fmt: skip
             except NoSolutionFound:
-                break  # wedged in: it gets no farther
+                break  # no feasible step: the hand is wedged between obstacles
             largest = float(np.abs(move[:n]).max())
             if largest > _LARGEST_STEP:
                 move *= _LARGEST_STEP / largest
@@ -173,7 +174,7 @@ class HandIk:
         return found
 
     def result(self, qpos: np.ndarray, targets: Targets) -> IkResult:
-        """Return a pose (nq,) with its errors."""
+        """Return a pose (nq,) as a result, with its errors."""
         model, shape = self.scene.model, self.shape
         data = posed(self.scene, qpos)
         away = data.geom_xpos[self.scene.index.point_geoms] - targets.points
@@ -195,8 +196,8 @@ class HandIk:
         )
 
     def approach(self, object_qpos: np.ndarray, targets: Targets) -> np.ndarray:
-        """Return the scene (nq,) with the palm near its target and straight fingers: a start for
-        :meth:`track`."""
+        """Return a start for :meth:`track`: the scene (nq,) with the palm near its target and
+        straight fingers."""
         model, shape, n = self.scene.model, self.shape, self.scene.index.num_joints
         qpos = np.concatenate((np.zeros(n), object_qpos))
         wrist = np.where(np.arange(len(targets.points)) == 0, 1.0, 0.1)
@@ -207,7 +208,7 @@ class HandIk:
         return self._couple(qpos)
 
     def _mean_posture(self) -> mink.PostureTask:
-        """Return the pull of the fingers towards the hand's mean pre-grasp."""
+        """Return the task that pulls the fingers towards the hand's mean pre-grasp."""
         model, first = self.scene.model, self.shape.first_finger_joint
         n = self.scene.index.num_joints
         cost, posture = np.zeros(model.nv), np.zeros(model.nq)

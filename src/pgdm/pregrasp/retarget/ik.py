@@ -1,8 +1,8 @@
-"""Inverse kinematics: poses a scene's hand as a human hand is.
+"""Inverse kinematics: poses a scene's hand like a human hand, free of penetration if possible.
 
 Differential inverse kinematics (:class:`pgdm.pregrasp.retarget.hand_ik.HandIk`) is tried in two
-ways: straight to the targets, then freed from penetration; and from a distance with open fingers,
-with object and table as obstacles. The result of least cost is taken.
+ways: directly to the targets, then freed from penetration; and from a distance with open fingers,
+avoiding object and table. The result of least cost is used.
 """
 
 from __future__ import annotations
@@ -19,30 +19,31 @@ from pgdm.pregrasp.retarget.keypoints import Keypoints
 from pgdm.pregrasp.retarget.targets import Targets
 from pgdm.sim.scene import Scene
 
-# Poses tried for freedom: how far the fingertips open and the palm moves off.
+# Poses that may be free: how far the fingertips open and the palm backs off.
 _OPENINGS_M = tuple((opening, lift) for lift in (0.0, 0.01) for opening in (0.006, 0.015, 0.03))
-_FIRST_TRIES = 3  # searches that are always run; more only while none is good enough
+_FIRST_TRIES = 3  # searches that are always run; more only while no result is good enough
 _RETREATS_M = (0.1, 0.06)  # distances from which the hand approaches the object
 _FREEING = FreeingCfg(
     slide_m=0.01, hinge_rad=0.08, depth_weight=60.0, move_weight=1e-3, negligible_m=1e-9
 )
-"""Weights in m of fingertip error."""
-_FAR_M = 0.01  # scale from which on a point's error counts more than in proportion
+"""Settings of the search that frees the hand; its cost is in m of mean fingertip error."""
+_FAR_M = 0.01  # an error of this size counts twice its value, see `pushed_out`
 
 
 def solve_hand(
     scene: Scene | HandIk, keypoints: Keypoints, object_qpos: np.ndarray, *, seed: int = 0
 ) -> IkResult:
-    """Return the scene's hand posed as a human hand is, touching nothing if possible.
+    """Return the scene's hand posed like a human hand, touching nothing if possible.
 
     Args:
-        scene: scene of the task, or a :class:`HandIk` of it, which saves its set-up.
+        scene: scene of the task, or an existing :class:`HandIk` of it, to save the set-up.
         keypoints: the human hand, world frame.
-        object_qpos: joints of all objects (nq - n,); they stay.
+        object_qpos: joint positions of all objects (nq - n,); they stay.
         seed: seed of the search that frees the hand.
 
     Raises:
-        ConfigError: the hand's points cannot follow a human hand.
+        ConfigError: the hand's points do not have the layout that
+            :class:`pgdm.pregrasp.retarget.targets.HandShape` needs.
     """
     ik = scene if isinstance(scene, HandIk) else HandIk(scene)
     targets = ik.shape.targets(keypoints)
@@ -51,8 +52,8 @@ def solve_hand(
     if straight.depth_m == 0.0:
         return straight
     poses = [*_opened(ik, targets, straight.qpos), *_from_afar(ik, targets, begin)]
-    # The search takes most of the time: it starts at the best two and the straight pose, and
-    # elsewhere only while none of these is good enough.
+    # The search takes most of the time: it starts from the best two and the direct result
+    # (`straight`), and from others only while none of these is good enough.
     poses = sorted((ik.result(q, targets) for q in poses), key=lambda r: r.cost)
     tries = [(one.qpos, seed) for one in (*poses[:2], straight)]
     tries += [(one.qpos, seed + 1 + i) for i, one in enumerate((*poses[2:5], straight))]
@@ -65,14 +66,15 @@ def solve_hand(
 
 
 def pushed_out(ik: HandIk, qpos: np.ndarray, targets: Targets, seed: int = 0) -> np.ndarray:
-    """Return joint positions (nq,) near ``qpos`` with the least penetration, ideally none.
+    """Return the scene (nq,) near ``qpos`` with the least penetration, ideally none.
 
-    Its cost of leaving the targets is, over the hand's points p with errors e_p and weights w_p
-    relative to the heaviest fingertip,
+    The cost of leaving the targets, for the hand's points p with errors e_p, weights w_p relative
+    to the largest fingertip weight, and F fingertips, is
 
         sum_p w_p e_p (1 + e_p / 1 cm) / F
 
-    so that no finger pays for all. Equal arguments give an equal result.
+    It grows faster than the errors, so that they spread over the fingers. Equal arguments give an
+    equal result.
 
     Args:
         ik: inverse kinematics of the scene.
@@ -98,7 +100,7 @@ def pushed_out(ik: HandIk, qpos: np.ndarray, targets: Targets, seed: int = 0) ->
 
 
 def _freed(ik: HandIk, qpos: np.ndarray, targets: Targets, seed: int) -> IkResult:
-    """Return a pose freed from penetration, then as near to the targets as obstacles allow."""
+    """Free a pose from penetration, then bring it as near to the targets as obstacles allow."""
     out = pushed_out(ik, qpos, targets, seed)
     result = ik.result(out, targets)
     if result.depth_m > 0.0:
@@ -108,8 +110,8 @@ def _freed(ik: HandIk, qpos: np.ndarray, targets: Targets, seed: int) -> IkResul
 
 
 def _opened(ik: HandIk, targets: Targets, begin: np.ndarray) -> list[np.ndarray]:
-    """Return poses with the fingertips farther apart and the palm farther off; the first free one
-    closed again around the obstacles."""
+    """Return poses with the fingertips farther apart and the palm farther away, up to the first
+    that is free; that pose is closed again around the obstacles."""
     tips = targets.points[ik.shape.rows[:, 2]]
     outward = tips - tips.mean(axis=0)
     outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
@@ -121,13 +123,13 @@ def _opened(ik: HandIk, targets: Targets, begin: np.ndarray) -> list[np.ndarray]
         pose = ik.track(replace(targets, points=points), begin, steps=60)
         if ik.contact.depth(pose) == 0.0:
             found.append(ik.track(targets, pose, steps=40, avoid=True))
-            break  # the next ones are only farther off
+            break  # the next poses would only be farther from the targets
         found.append(pose)
     return found
 
 
 def _from_afar(ik: HandIk, targets: Targets, begin: np.ndarray) -> list[np.ndarray]:
-    """Return the poses of a hand that comes from a distance, around object and table."""
+    """Return poses that the hand reaches from a distance, avoiding object and table."""
     away = unit(object_to_hand(ik.scene, begin))
     found = []
     for distance in _RETREATS_M:

@@ -1,9 +1,9 @@
-"""The joints of a human right hand in one frame, checked: what inverse kinematics follows.
+"""Keypoints: the checked joints of a human right hand, which inverse kinematics follows.
 
-Points come in one of two orders, in metres. ``mano``: wrist, then index, middle, little, ring
-finger and thumb with three joints each from the palm outwards (16), optionally followed by the tips
-of thumb, index, middle, ring and little finger (21). ``openpose``: wrist, then thumb, index,
-middle, ring and little finger with three joints and a tip each (21).
+A file's points, in metres, have one of two orders. ``mano``: wrist, then index, middle, little,
+ring finger and thumb with three joints each from the palm outwards (16 points), optionally followed
+by the tips of thumb, index, middle, ring and little finger (21). ``openpose``: wrist, then thumb,
+index, middle, ring and little finger with three joints and a tip each (21).
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ FINGERS = ("index", "middle", "little", "ring", "thumb")
 """Fingers in the order of all arrays here, which is MANO's."""
 
 ORDERS = ("mano", "openpose")
-"""Orders that a file's points may have."""
+"""Orders of points that a file may have."""
 
 TIP_M = 0.02
-"""Length of a finger's last bone if no tip is given, along the bone before it."""
+"""If no tip is given, the last bone extends the bone before it by this length."""
 
 _OPENPOSE_FINGERS = ("thumb", "index", "middle", "ring", "little")
 _JOINTS = ("knuckle", "middle", "distal", "tip")
 _BONE_M = 0.005, 0.16
-"""Shortest and longest bone of a hand, from an infant's fingertip to the largest palm."""
+"""Shortest and longest plausible bone: an infant's fingertip, the largest palm."""
 _SPAN_M = 0.05
-"""Shortest distance from wrist to fingertip pad along the bones, an infant's."""
+"""Shortest plausible distance from the wrist to a finger's pad along the bones: an infant's."""
 _FLAT_M = 0.003
-"""How far a right hand's thumb may appear behind its back."""
+"""Measurement tolerance: how far the thumb of a right hand may lie behind the plane of the palm."""
 _WORLD_M = 1e6
 """Larger coordinates are refused, whatever their unit."""
 _MM, _CM = 1e-3, 1e-2
@@ -40,15 +40,15 @@ _MM, _CM = 1e-3, 1e-2
 
 @dataclass(frozen=True)
 class Keypoints:
-    """A right hand, world frame, m; :meth:`of` builds and checks one."""
+    """The keypoints of a right hand, world frame, m; :meth:`of` creates and checks them."""
 
     wrist: np.ndarray = field(repr=False)
-    """(3,)."""
+    """Position of the wrist (3,)."""
     fingers: np.ndarray = field(repr=False)
     """Knuckle, middle joint, distal joint and tip of each finger (5, 4, 3), in the order of
     :data:`FINGERS`; for the thumb, its three joints and its tip."""
     own: tuple[str, ...] = FINGERS
-    """Fingers that were measured; the others are filled in from their neighbours."""
+    """Fingers that were measured; the others are derived from their neighbours."""
 
     @classmethod
     def of(
@@ -62,8 +62,8 @@ class Keypoints:
             label: name of the points in error messages.
 
         Raises:
-            ConfigError: wrong count, a NaN, impossible bone lengths (units other than metres are
-                recognised), or a left hand.
+            ConfigError: the number of points is wrong, a coordinate is NaN, bone lengths are
+                impossible (perhaps in another unit than metres), or the hand is a left one.
         """
         points = np.asarray(points, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or len(points) not in (16, 21):
@@ -83,17 +83,17 @@ class Keypoints:
 
     @property
     def pads(self) -> np.ndarray:
-        """Middles of the last bones (5, 3), where fingers touch things."""
+        """The fingers' pads: middles of their last bones (5, 3), where fingers touch things."""
         return self.fingers[:, 2:].mean(axis=1)
 
     @property
     def joints(self) -> np.ndarray:
-        """MANO's 16 joints (16, 3)."""
+        """The 16 joints in MANO's order (16, 3)."""
         return np.concatenate((self.wrist[None], self.fingers[:, :3].reshape(15, 3)))
 
     @property
     def span_m(self) -> float:
-        """Largest distance from the wrist to a measured finger's pad, along its bones."""
+        """Largest distance from the wrist to the pad of a measured finger, along the bones."""
         chain = np.concatenate(
             (np.broadcast_to(self.wrist, (5, 1, 3)), self.fingers[:, :2], self.pads[:, None]),
             axis=1,
@@ -105,7 +105,7 @@ class Keypoints:
         """Return the palm's axes as columns (3, 3): see :func:`palm_axes`.
 
         Args:
-            fingers: whose knuckles span the palm, starting at the thumb's side.
+            fingers: fingers whose knuckles define the palm, starting at the thumb's side.
         """
         knuckles = self.fingers[[FINGERS.index(name) for name in fingers], 0]
         return palm_axes(self.wrist, knuckles)
@@ -121,7 +121,7 @@ class Keypoints:
         """Check that this is a right hand of human size.
 
         Raises:
-            ConfigError: it is not.
+            ConfigError: it is a left hand, or not of human size; ``label`` names it.
         """
         bones = _bones(self)
         typical = float(np.median(bones))
@@ -171,17 +171,17 @@ def palm_axes(wrist: np.ndarray, knuckles: np.ndarray) -> np.ndarray:
 
 
 def filled(wrist: np.ndarray, known: dict[str, np.ndarray]) -> Keypoints:
-    """Return a hand of which only some fingers are known.
+    """Return a hand from some known fingers; the other fingers are filled in.
 
     An unknown finger is interpolated or extrapolated from the two nearest known ones; an unknown
     thumb is a copy of the index finger.
 
     Args:
         wrist: (3,) m.
-        known: knuckle, middle joint, distal joint and tip (4, 3) m by finger.
+        known: knuckle, middle joint, distal joint and tip (4, 3) m, by name of the finger.
 
     Raises:
-        ConfigError: fewer than two fingers besides the thumb, or an unknown name.
+        ConfigError: fewer than two fingers besides the thumb are known, or a name is unknown.
     """
     for name in known:
         check_name("finger", name, FINGERS)
@@ -204,7 +204,7 @@ def filled(wrist: np.ndarray, known: dict[str, np.ndarray]) -> Keypoints:
 
 
 def _sorted(points: np.ndarray, order: str, label: str) -> np.ndarray:
-    """Return fingers (5, 4, 3) of points (16|21, 3)."""
+    """Return the fingers (5, 4, 3), in the order of :data:`FINGERS`, of points (16|21, 3)."""
     if order == "openpose":
         if len(points) != 21:
             raise ConfigError(f"{label}: order openpose has 21 points, not {len(points)}")
@@ -216,18 +216,18 @@ def _sorted(points: np.ndarray, order: str, label: str) -> np.ndarray:
     else:
         last = joints[:, 2] - joints[:, 1]
         length = np.maximum(np.linalg.norm(last, axis=1, keepdims=True), 1e-12)
-        # In the file's own unit, so that the check recognises a file in millimetres.
+        # In the unit of the points, so that the check can recognise points in millimetres.
         tips = joints[:, 2] + last * (_tip_length(joints) / length)
     return np.concatenate((joints, tips[:, None]), axis=1)
 
 
 def _tip_length(joints: np.ndarray) -> float:
-    """Return the length of a last bone in the unit of the joints (5, 3, 3)."""
+    """Return the length to assume for a last bone, in the unit of the joints (5, 3, 3)."""
     typical = float(np.median(np.linalg.norm(np.diff(joints, axis=1), axis=-1)))
     return TIP_M if typical < _BONE_M[1] else 0.7 * typical
 
 
 def _bones(hand: Keypoints) -> np.ndarray:
-    """Return lengths (5, 4) from the wrist along each finger."""
+    """Return the lengths of the bones (5, 4) from the wrist along each finger."""
     chain = np.concatenate((np.broadcast_to(hand.wrist, (5, 1, 3)), hand.fingers), axis=1)
     return np.linalg.norm(np.diff(chain, axis=1), axis=-1)

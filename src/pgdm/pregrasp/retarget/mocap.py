@@ -1,7 +1,8 @@
-"""From a recorded human hand to a pre-grasp of a scene's hand.
+"""Turns a recorded human hand into a pre-grasp of a scene's hand.
 
-The human joints come from the library, from a file, or, if neither has any, from the points of the
-task's own hand at its mined pre-grasp: so any hand can do any task.
+The human joints come from the library or from a file. If there are none, those of a human hand are
+placed at the points of the task's own hand in its stored pre-grasp, so that any hand has something
+to follow.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from pgdm.sim.contact import FREE_M
 from pgdm.sim.scene import Scene
 
 FAR_M = 0.05
-"""A pre-grasp whose fingertips are farther from their targets on average is refused."""
+"""A pre-grasp is refused if its fingertips are farther from their targets on average."""
 DEEP_M = 0.001
-"""So is one that penetrates something deeper than this."""
+"""A pre-grasp is refused if the hand penetrates something deeper than this."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +42,15 @@ class Retargeted:
 
     pregrasp: Pregrasp
     result: IkResult
-    frame: int
+    frame: int  # index of the recording's frame that it follows
     fingers: tuple[str, ...]
-    """Human finger of each fingertip."""
+    """Human finger that each fingertip follows."""
     measured: tuple[int, ...]
-    """Fingertips whose human finger was measured; the others do not count."""
+    """Indices of the fingertips whose human finger was measured; only these are judged."""
 
     @property
     def errors_m(self) -> np.ndarray:
-        """Distances of the measured fingertips from their targets."""
+        """Distances of the fingertips in ``measured`` from their targets."""
         return self.result.fingertip_errors_m[list(self.measured)]
 
     @property
@@ -61,7 +62,7 @@ class Retargeted:
             for i in self.result.unreached
             if i in self.measured
         ]
-        # The base's slides have this prefix in all hands.
+        # The names of the base's slides start with ART in all hands.
         slides = [n for n in self.result.at_limit if n.rpartition("/")[2].startswith("ART")]
         if slides:
             found.append(f"the base is at the end of {', '.join(slides)}")
@@ -71,7 +72,7 @@ class Retargeted:
 
     @property
     def fit(self) -> str:
-        """How well the hand fits, in words."""
+        """How closely the hand follows, in words."""
         errors = self.errors_m
         return (
             f"fingertips {1e3 * errors.mean():.0f} mm from the human's on average, "
@@ -80,9 +81,9 @@ class Retargeted:
 
 
 def of_expert(expert: Expert, motion: Motion) -> Recording:
-    """Return the library's human hand of a task; the pre-grasp is its first frame.
+    """Return the library's human hand of a task as a recording; its first frame is the pre-grasp.
 
-    The motion's positions are those of the object's origin, as in the original recordings.
+    The motion's positions are taken as those of the mesh's origin, as in the original recordings.
     """
     label = f"the library's human hand of {expert.task}"
     frames = tuple(Keypoints.of(joints, "mano", label) for joints in expert.human_joints)
@@ -90,7 +91,7 @@ def of_expert(expert: Expert, motion: Motion) -> Recording:
 
 
 def of_hand(scene: Scene, start: Start) -> Recording:
-    """Return one frame of a human hand whose joints are at a robot hand's points.
+    """Return a recording of one frame: a human hand whose joints are at a robot hand's points.
 
     Args:
         scene: scene of the task with its own hand.
@@ -103,7 +104,7 @@ def of_hand(scene: Scene, start: Start) -> Recording:
 
 
 def of_task(library: Library, own: Scene, motion: Motion) -> Recording:
-    """Return the human hand of a task: the recorded one, or one at the points of its own hand.
+    """Return the human hand of a task: recorded, or derived from the points of the task's own hand.
 
     Args:
         library: library with the task.
@@ -111,7 +112,7 @@ def of_task(library: Library, own: Scene, motion: Motion) -> Recording:
         motion: motion of the task.
 
     Raises:
-        ConfigError: the task has neither.
+        ConfigError: the task has neither a human hand nor a pre-grasp of its own hand.
     """
     if motion.id in library.experts().experts:
         return of_expert(library.expert(motion.id), motion)
@@ -128,11 +129,12 @@ def of_task(library: Library, own: Scene, motion: Motion) -> Recording:
 def frame_before_contact(recording: Recording, library: Library, scene: Scene) -> int:
     """Return the last frame of a recording before a finger touches the object.
 
-    A finger touches within 8 mm, as in the library's contacts. Returns 0 if the object's pose is
-    unknown or the hand touches in the first frame, and the last frame if it never touches.
+    A finger counts as touching within 8 mm, as in the library's contacts. Returns 0 if the object's
+    pose is unknown or a finger touches in the first frame, and the last frame if none ever touches.
 
     Raises:
-        ConfigError: the object is attached to something, so that one pose does not determine it.
+        ConfigError: the object is attached to something, such as a door, and its recorded pose does
+            not determine where its parts are.
         CorruptAssetError: the object has no parts to touch.
     """
     count, position, orientation = len(recording.frames), recording.position, recording.orientation
@@ -141,7 +143,7 @@ def frame_before_contact(recording: Recording, library: Library, scene: Scene) -
     if not scene.lies_free:
         raise ConfigError(
             f"{recording.origin}: has {count} frames, and the object of task '{scene.task.id}' "
-            "is attached to something, so that contact cannot be detected: choose one with --frame"
+            "is attached to something, so that contact cannot be detected: choose a frame (--frame)"
         )
     xml = library.object_xml(scene.task.objects[0], scene.asset_source)
     joints = np.stack([hand.joints for hand in recording.frames])
@@ -158,23 +160,23 @@ def retarget(
     frame: int | None = None,
     seed: int = 0,
 ) -> Retargeted:
-    """Return the pre-grasp of a scene's hand that follows a human hand.
+    """Return the pre-grasp in which a scene's hand follows a human hand.
 
-    The object is where the task's stored start has it. A recording with object poses is moved as a
-    whole so that its object coincides with the task's.
+    The object is where the task's stored start has it. If the recording has object poses, each
+    frame is moved rigidly so that its object coincides with the task's.
 
     Args:
         scene: scene of the task, with the hand that is to do it.
         library: library with the object.
         motion: motion of the task.
-        recording: the human hand.
-        frame: which of its frames; by default the recording's own choice (the first for the
-            library's recordings, the benchmark's pre-grasp), else the last one before contact.
-        seed: seed of the search.
+        recording: recording of the human hand.
+        frame: index of the frame to follow; by default ``recording.chosen`` (the first frame for
+            the library's recordings, like the mined pre-grasps), else the last before contact.
+        seed: seed of the search that frees the hand.
 
     Raises:
-        ConfigError: there is no such frame, the hand's points cannot follow a human hand, or the
-            recording has poses of an object that is attached to something.
+        ConfigError: there is no such frame, the hand's points do not have the layout that inverse
+            kinematics needs, or the recording has poses of an object attached to something.
     """
     objects = object_joints(motion, scene)
     recording = _placed(recording, scene, objects)
@@ -204,16 +206,16 @@ def check(made: Retargeted, scene: Scene) -> None:
     if errors.mean() > FAR_M or depth > DEEP_M:
         raise ConfigError(
             f"hand '{scene.hand.name}' cannot do task '{scene.task.id}': "
-            f"{'; '.join(made.unreachable)}. Pose it by hand (pgdm pregrasp label), or start "
+            f"{'; '.join(made.unreachable)}. Pose it yourself (pgdm pregrasp label), or start "
             "without a pre-grasp (pregrasp=none)"
         )
 
 
 def _placed(recording: Recording, scene: Scene, objects: np.ndarray) -> Recording:
-    """Return the recording moved so that its object is where the task has it, in every frame."""
+    """Return the recording with each frame moved so that its object is where the task has it."""
     data = posed(scene, np.concatenate((scene.index.reset, objects)))
     body, count = scene.index.object_body, len(recording.frames)
-    while scene.model.body_parentid[body]:  # a recorded pose is that of the mesh's origin
+    while scene.model.body_parentid[body]:  # the root body is at the mesh's origin, as recorded
         body = int(scene.model.body_parentid[body])
     there, home_rotation = data.xpos[body].copy(), data.xmat[body].reshape(3, 3).copy()
     position = np.repeat(there[None], count, axis=0)

@@ -1,4 +1,4 @@
-"""Files of human hand joints: frames of keypoints, optionally with the object's pose.
+"""Reads recordings of human hand joints: frames of keypoints, optionally with object poses.
 
 docs/pregrasps/mocap.md describes the formats. Reading a file never runs code from it.
 """
@@ -30,31 +30,31 @@ KEYS = (
     *("joints", "order", "object_position", "object_orientation"),
     "object_orientation_order",
 )
-"""Arrays that a file may hold."""
+"""Keys that a ``.npz`` or ``.json`` file may have."""
 
 COLUMNS = ("frame", "joint", "x", "y", "z")
-"""First line of a ``.csv``."""
+"""Columns of a ``.csv`` file, named in its first line."""
 
 MAX_FRAMES = 100_000
-"""Recordings of one grasp are far shorter."""
+"""Longer recordings are refused; those of one grasp are far shorter."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Motion of a person's right hand, world frame, m."""
+    """Recorded motion of a person's right hand, world frame, m."""
 
     frames: tuple[Keypoints, ...] = field(repr=False)
-    """One hand per frame, N."""
+    """Keypoints of the hand in each of N frames."""
     position: np.ndarray | None = field(default=None, repr=False)
     """Position of the object body's origin (N, 3) m; None if unknown."""
     orientation: np.ndarray | None = field(default=None, repr=False)
     """Orientation of the object's body (N, 4), unit quaternions wxyz; None if unknown."""
     origin: str = ""
-    """Where it came from, for messages."""
+    """Where the recording comes from, for messages."""
     chosen: int | None = None
-    """The frame that is the pre-grasp, if known."""
+    """Index of the frame that is the pre-grasp; None if unknown."""
     ordered: bool = True
-    """Whether the order of the quaternions' numbers is known, not assumed."""
+    """Whether the file states the order of the quaternions' numbers; else wxyz is assumed."""
 
 
 def read(path: Path) -> Recording:
@@ -64,7 +64,8 @@ def read(path: Path) -> Recording:
         path: ``.npz``, ``.json`` or ``.csv``.
 
     Raises:
-        ConfigError: the extension is unknown, or the joints are not a right hand in metres.
+        ConfigError: the extension or a key is unknown, or the joints are not a right hand in
+            metres.
         CorruptAssetError: the file is missing, damaged, or lacks an array.
     """
     readers = {".npz": safe_npz.read_npz, ".json": _read_json, ".csv": _read_csv}
@@ -78,17 +79,17 @@ def read(path: Path) -> Recording:
 
 
 def parse(arrays: Mapping[str, Any], label: str) -> Recording:
-    """Check the contents of a file.
+    """Check the contents of a file and return them as a recording.
 
     Args:
-        arrays: some of :data:`KEYS`: ``joints`` (16|21, 3) or (N, 16|21, 3), ``order``,
-            ``object_position`` (3,) or (N, 3) and ``object_orientation`` (4,) or (N, 4), wxyz or
-            in ``object_orientation_order``.
-        label: the file's name, for messages.
+        arrays: ``joints`` (16|21, 3) or (N, 16|21, 3) m; optionally ``order``, ``object_position``
+            (3,) or (N, 3) m, and ``object_orientation`` (4,) or (N, 4), wxyz unless
+            ``object_orientation_order`` says otherwise.
+        label: name of the file, for messages.
 
     Raises:
-        ConfigError: the joints are not a right hand in metres.
-        CorruptAssetError: an array is missing, has a wrong shape or a NaN.
+        ConfigError: the joints are not a right hand in metres, or an order is unknown.
+        CorruptAssetError: an array is missing, has a wrong shape or contains NaN.
     """
     if "joints" not in arrays:
         raise CorruptAssetError(f"{label}: lacks 'joints'; it has {', '.join(sorted(arrays))}")

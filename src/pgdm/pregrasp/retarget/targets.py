@@ -1,7 +1,8 @@
-"""Where the points of a robot hand should be for it to follow a human hand.
+"""Targets of a robot hand's points with which the robot hand follows a human hand.
 
-Each bone keeps its human direction and gets the robot's length, chained from an anchor that stays:
-the wrist outwards, or the pads of the fingers inwards.
+Each bone keeps its direction in the human hand and gets the robot's length. The bones are chained
+from an anchor, which stays in place: outwards from the wrist, or inwards from the fingers' pads
+(middles of their last bones).
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from pgdm.pregrasp.retarget.keypoints import FINGERS, Keypoints, filled, palm_ax
 from pgdm.sim.scene import Scene
 
 ANCHORS = ("wrist", "pads")
-"""What stays where the human hand has it: the wrist, as in the published trajectories, or the pads
-of the fingers, for hands of another size."""
+"""The points that stay where the human hand has them: the wrist, as in the published trajectories,
+or the fingers' pads, for robot hands of another size."""
 
 LIKE_A_PERSON = 0.8, 1.35
-"""Range of the robot's length, relative to the human's, in which both count as of equal size."""
+"""Range of the robot hand's length relative to the human hand's in which they count as equal."""
 
 _WEIGHTS = {"wrist": (0.6, 0.6, 0.6, 1.0), "pads": (0.05, 0.05, 0.1, 1.0)}
-"""Weights of wrist, knuckles, middle points and tips, per m of error."""
+"""Weights of wrist, knuckles, middle points and distal points (the fingertips), 1/m, by anchor."""
 _PALM_WEIGHT = {"wrist": 0.0, "pads": 0.02}
-"""Weight of the palm's orientation, per rad of error."""
+"""Weight of the palm's orientation, 1/rad, by anchor."""
 _ACROSS = ("index", "middle", "ring", "little")
 _LAST_M = 0.01
 """Distance from a finger's distal joint to the middle of its last bone."""
@@ -33,28 +34,28 @@ _LAST_M = 0.01
 
 @dataclass(frozen=True)
 class Targets:
-    """What inverse kinematics should reach, world frame."""
+    """Targets of inverse kinematics, world frame."""
 
     points: np.ndarray = field(repr=False)
-    """Targets of the hand's points (P, 3) m."""
+    """Target positions of the hand's tracked points (P, 3) m."""
     weights: np.ndarray = field(repr=False)
-    """Weights of the points (P,), per m; 0 leaves a point free."""
+    """Weights of the points (P,), 1/m; 0 leaves a point free."""
     palm: np.ndarray = field(repr=False)
-    """Orientation of the palm (3, 3), axes as in
+    """Target orientation of the palm (3, 3), axes as in
     :func:`pgdm.pregrasp.retarget.keypoints.palm_axes`."""
     palm_weight: float
-    """Weight of the palm's orientation, per rad."""
+    """Weight of the palm's orientation, 1/rad."""
     scale: float
-    """Length of the robot's hand divided by the human's."""
+    """Length of the robot hand divided by that of the human hand."""
     anchor: str
     """One of :data:`ANCHORS`."""
 
 
 class HandShape:
-    """The points of a scene's hand, by finger, and its bones.
+    """The tracked points of a scene's hand, by finger, and the bones between them.
 
     Args:
-        scene: scene with its hand.
+        scene: scene with the hand.
 
     Raises:
         ConfigError: the hand's points are not the wrist, then knuckle, middle and distal point of
@@ -67,10 +68,10 @@ class HandShape:
         """Human finger that each robot finger follows, in the order of the hand's fingertips."""
         _check(hand.name, self.fingers, hand.fingertips, len(hand.points))
         self.rows = np.array([[tip - 2, tip - 1, tip] for tip in hand.fingertips])
-        """Rows of the points (F, 3): knuckle, middle, distal."""
+        """Indices of each finger's knuckle, middle and distal point among the points (F, 3)."""
         self.first_finger_joint = hand.num_base_joints + hand.num_wrist_joints
         self.palm_body = int(model.jnt_bodyid[self.first_finger_joint - 1])
-        """Body that the last wrist joint moves."""
+        """Id of the body that the last joint before the fingers moves."""
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         rest = data.geom_xpos[scene.index.point_geoms]
@@ -80,7 +81,7 @@ class HandShape:
         self.lengths = np.linalg.norm(
             np.diff(np.insert(rest[self.rows], 0, rest[0], axis=1), axis=1), axis=-1
         )
-        """Lengths of the bones wrist to knuckle to middle to distal point (F, 3) m."""
+        """Lengths (F, 3) m of the bones from wrist to knuckle, middle point and distal point."""
         axes = palm_axes(rest[0], rest[self.rows[self._across, 0]])
         self.palm_in_body = rotation.T @ axes
         """The palm's axes in the frame of the palm's body (3, 3)."""
@@ -88,11 +89,11 @@ class HandShape:
 
     @property
     def span_m(self) -> float:
-        """Largest distance from the wrist to a fingertip along the bones."""
+        """Largest distance from the wrist to a distal point along the bones."""
         return float(self.lengths.sum(axis=1).max())
 
     def keypoints(self, points: np.ndarray) -> Keypoints:
-        """Return a human hand whose joints are at the robot's points (P, 3) m."""
+        """Return a human hand whose joints are at the robot hand's points (P, 3) m."""
         known = {}
         for name, (knuckle, middle, distal) in zip(self.fingers, points[self.rows], strict=True):
             last = distal - middle
@@ -101,12 +102,12 @@ class HandShape:
         return filled(points[0], known)
 
     def targets(self, human: Keypoints, anchor: str | None = None) -> Targets:
-        """Return the targets of the points.
+        """Return the targets with which the robot hand follows a human hand.
 
         Args:
-            human: the hand to follow.
+            human: the human hand.
             anchor: one of :data:`ANCHORS`; by default the wrist if all five fingers were measured
-                and both hands are of equal size, else the pads.
+                and the hands have about the same size, else the pads.
         """
         scale = self.span_m / human.span_m
         if anchor is None:
@@ -135,12 +136,12 @@ class HandShape:
         weights[0], *others = _WEIGHTS[anchor]
         weights[self.rows] = others
         for row, name in zip(self.rows, self.fingers, strict=True):
-            # A finger that was not measured only has to stay out of the way.
+            # A finger that was not measured only needs to be roughly in place.
             weights[row] *= 1.0 if name in human.own else 0.1
         return Targets(points, weights, palm, _PALM_WEIGHT[anchor], scale, anchor)
 
     def measured(self, human: Keypoints) -> list[int]:
-        """Return the numbers of the robot's fingers that follow a measured finger."""
+        """Return the indices of the robot's fingers that follow a measured human finger."""
         return [i for i, name in enumerate(self.fingers) if name in human.own]
 
 

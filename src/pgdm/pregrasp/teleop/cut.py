@@ -1,7 +1,7 @@
 """Pre-grasps cut from tele-operated demonstrations, just before the hand takes hold.
 
-A demonstration's states are put into the task's own scene kinematically, and moved as a whole so
-that the object is where the task has it; the simulator's contacts show when the hand touches.
+The states of a demonstration are set kinematically in the task's scene, translated together so that
+the object is where the task has it. The simulator's contacts then show when the hand takes hold.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from pgdm.sim.contact import FREE_M, HandContact
 from pgdm.sim.scene import Scene
 
 LASTING_STEPS = 5
-"""A contact of fewer control steps (0.2 s) does not count as a hold."""
+"""The hand takes hold if a contact lasts at least this many control steps (0.2 s)."""
 FITS_M = 0.01
-"""If the scene's hand misses the observed palm by more, the demonstration is of another hand."""
+"""If the palm misses its observed position by more, the demonstration is of another hand."""
 BEYOND_M = 0.02
-"""Largest excess over the slides' ranges with which a demonstration can be followed."""
+"""Largest distance by which a demonstration may exceed the slides' ranges."""
 
 
 @dataclass(frozen=True)
@@ -32,16 +32,17 @@ class Layout:
     """Layout of an observation, and the joints of the task's scene that it sets."""
 
     environment: str
-    """Environment that the observations come from, for messages."""
+    """Name of the environment that the observations come from, for messages."""
     size: int
     """Length of an observation."""
     joints: dict[int, slice]
-    """First index in qpos, and the part of the observation that is written from there."""
+    """Slices of the observation that hold joint positions, by the first index in qpos that they
+    are written to."""
     palm: slice
-    """World position of the palm's site (3)."""
+    """Slice that holds the world position (3) of ``palm_site``, m."""
     palm_site: str
     thing: slice
-    """World position of a site of the object (3)."""
+    """Slice that holds the world position (3) of ``thing_site``, a site of the object, m."""
     thing_site: str
 
 
@@ -57,29 +58,29 @@ LAYOUTS = {
         thing_site="door/S_handle",
     )
 }
-"""Known layouts, by task."""
+"""Known layouts, by task id."""
 
 
 @dataclass(frozen=True)
 class Replay:
-    """A demonstration in the task's scene."""
+    """A demonstration set in the task's scene."""
 
-    number: int
+    number: int  # of the demonstration in its file, from 0
     qpos: np.ndarray = field(repr=False)
-    """Whole scene (T, nq) at each step, slides within their ranges."""
+    """Whole scene (T, nq) at each step, the hand's joints clipped to their ranges."""
     shift_m: float
-    """Distance of the demonstration's object from where the task has it."""
+    """Distance between the object's positions in the demonstration and in the task."""
     beyond_m: float
     """How far the slides would have to exceed their ranges in the step before the hold."""
     palm_error_m: float
-    """Largest distance of the palm from its observed position along the vertical and sideways
-    slides, which the demonstrations' hand does not have."""
+    """Largest distance of the palm from its observed position along the first two slides, which the
+    demonstrations' hand does not have."""
     touching: np.ndarray = field(repr=False)
-    """Whether the hand touches anything in each step (T,)."""
+    """Whether the hand touches anything in each step (T,), bool."""
 
     @property
     def hold(self) -> int | None:
-        """First step of a contact that lasts :data:`LASTING_STEPS`; None if there is none."""
+        """First step of the first contact that lasts :data:`LASTING_STEPS`; None if none does."""
         run = 0
         for step, touches in enumerate(self.touching):
             run = run + 1 if touches else 0
@@ -92,7 +93,7 @@ def layout_of(task: str) -> Layout:
     """Return the layout of a task's observations.
 
     Raises:
-        UnknownNameError: no layout of its observations is known.
+        UnknownNameError: no layout is known for the task.
     """
     if task not in LAYOUTS:
         hint = "Other observations cannot be read yet."
@@ -101,11 +102,11 @@ def layout_of(task: str) -> Layout:
 
 
 def replay(scene: Scene, demonstration: Demonstration) -> Replay:
-    """Put a demonstration's states into the task's scene.
+    """Set a demonstration's states in the task's scene.
 
     Raises:
-        UnknownNameError: no layout of the task's observations is known.
-        ConfigError: the observations are of another size or hand, or the palm misses one.
+        UnknownNameError: no layout is known for the task.
+        ConfigError: the observations have another size or are of another hand.
     """
     layout, model, n = layout_of(scene.task.id), scene.model, scene.index.num_joints
     _check(scene, demonstration, layout)
@@ -115,12 +116,12 @@ def replay(scene: Scene, demonstration: Demonstration) -> Replay:
         values = observed[:, part]
         qpos[:, first : first + values.shape[1]] = values
     slides, axes, shift = _slides(scene, observed, qpos, layout)
-    # The demonstrations' hand slides along its third axis only: the other two measure the fit.
+    # The demonstrations' hand has only the third slide: the first two should come out as 0.
     missed = float(np.abs(slides[:, :2]).max())
     if missed > FITS_M:
         raise ConfigError(
             f"demonstration {demonstration.number}: the palm is up to {1e3 * missed:.0f} mm from "
-            f"where it was observed; it is from another hand than that of {layout.environment}"
+            f"its observed position; recorded with another hand than that of {layout.environment}"
         )
     slides += axes @ shift
     low, high = model.jnt_range[:n].T
@@ -142,18 +143,18 @@ def _check(scene: Scene, demonstration: Demonstration, layout: Layout) -> None:
         )
     if (hand := layout.palm_site.partition("/")[0]) != scene.hand.name:
         raise ConfigError(
-            f"demonstrations of {scene.task.id} are of hand {hand}, not {scene.hand.name}; follow "
-            f"them with another hand by pgdm pregrasp mocap {scene.task.id} --hand"
+            f"demonstrations of {scene.task.id} are of hand {hand}, not {scene.hand.name}; for "
+            f"another hand use 'pgdm pregrasp mocap {scene.task.id} --hand NAME'"
         )
 
 
 def _slides(
     scene: Scene, observed: np.ndarray, qpos: np.ndarray, layout: Layout
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the slides (T, 3) m that bring the palm of qpos (T, nq) to where it was observed.
+    """Return the slides (T, 3) m that bring the palm of qpos (T, nq) to its observed positions.
 
-    Also the slides' axes (3, 3), rows, world frame, and the vector (3,) m from where the object was
-    observed in the first step to where the scene has it.
+    Also returns the slides' axes as rows (3, 3), world frame, and the vector (3,) m from the
+    object's observed position in the first step to its position in the scene.
     """
     model, data = scene.model, mujoco.MjData(scene.model)
     mujoco.mj_kinematics(model, data)
@@ -174,13 +175,14 @@ def cut(scene: Scene, made: Replay, objects: np.ndarray, origin: str) -> Pregras
 
     Args:
         scene: scene of the task.
-        made: the demonstration in it.
-        objects: joints of the objects where the task starts (nq - n,); a door that was brushed
-            open is closed again.
-        origin: the file, for messages.
+        made: the demonstration set in this scene.
+        objects: joint positions of the objects at the task's start (nq - n,). They replace the
+            demonstration's, such as those of a door that was brushed open.
+        origin: the demonstration's file, for messages.
 
     Raises:
-        ConfigError: the hand never takes hold, does so in the first step, or cannot get there.
+        ConfigError: the hand never takes hold, does so in the first step, or would have to exceed
+            its slides' ranges.
     """
     label = f"demonstration {made.number} of {origin}"
     hold = made.hold
@@ -190,7 +192,7 @@ def cut(scene: Scene, made: Replay, objects: np.ndarray, origin: str) -> Pregras
         raise ConfigError(f"{label}: the hand already holds something in the first step")
     if made.beyond_m > BEYOND_M:
         raise ConfigError(
-            f"{label}: its object is {1e2 * made.shift_m:.0f} cm from the task's, and the slides "
+            f"{label}: the object is {1e2 * made.shift_m:.0f} cm from the task's, and the slides "
             f"of hand '{scene.hand.name}' would have to exceed their ranges by "
             f"{1e3 * made.beyond_m:.0f} mm to follow; choose another demonstration"
         )
@@ -219,14 +221,14 @@ def cut(scene: Scene, made: Replay, objects: np.ndarray, origin: str) -> Pregras
 
 
 def nearest(replays: list[Replay]) -> Replay:
-    """Return, of the demonstrations that take hold, the one with the object nearest to the task's.
+    """Return the demonstration that takes hold with the object nearest to the task's.
 
     Raises:
-        ConfigError: none takes hold within the slides' ranges.
+        ConfigError: no demonstration takes hold within the slides' ranges.
     """
     fit = [r for r in replays if r.hold and r.beyond_m <= BEYOND_M]
     if not fit:
         raise ConfigError(
-            f"none of {len(replays)} demonstrations takes hold where the hand can get"
+            f"none of {len(replays)} demonstrations takes hold within the ranges of the slides"
         )
     return min(fit, key=lambda r: (r.shift_m, r.number))

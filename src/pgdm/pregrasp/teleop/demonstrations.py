@@ -1,7 +1,7 @@
-"""Reads tele-operated demonstrations, DAPG pickles and Minari datasets, without running code.
+"""Reads tele-operated demonstrations from DAPG pickles and Minari datasets without running code.
 
-Only the observations are read, which is all that a pre-grasp needs. docs/pregrasps/teleop.md lists
-the groups of a file that hold them.
+Only the observations are read, which is all that a pre-grasp needs. docs/pregrasps/teleop.md
+describes the file formats.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pgdm.library.files.pickles import reason
 PICKLES = (".pickle", ".pkl")
 HDF5 = (".hdf5", ".h5")
 MINARI_FILE = Path("data", "main_data.hdf5")
-"""File of the episodes in a Minari dataset's folder."""
+"""Path of the episodes' file in the folder of a Minari dataset."""
 MAX_STEPS = 1_000_000
 
 
@@ -31,7 +31,7 @@ class Demonstration:
     """The observations of one demonstration."""
 
     number: int
-    """In the file, from 0."""
+    """Number in the file, from 0."""
     observations: np.ndarray = field(repr=False)
     """(T, D), one row per control step."""
 
@@ -44,7 +44,7 @@ def read(path: Path) -> list[Demonstration]:
 
     Raises:
         UnknownNameError: the extension is unknown.
-        UnsafePickleError: the pickle contains more than plain arrays.
+        UnsafePickleError: the pickle contains more than arrays, containers, strings and numbers.
         CorruptAssetError: the file is missing, damaged, or holds no demonstrations.
     """
     if path.is_dir():
@@ -63,10 +63,10 @@ def read(path: Path) -> list[Demonstration]:
 
 
 def chosen(demonstrations: list[Demonstration], number: int, label: str) -> Demonstration:
-    """Return the demonstration with a number.
+    """Return the demonstration with a given number.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no such demonstration.
     """
     by_number = {one.number: one for one in demonstrations}
     if number not in by_number:
@@ -96,7 +96,9 @@ def _read_hdf5(path: Path) -> list[Demonstration]:
                 label = f"{path}, {name}"
                 data = group.get("observations") if isinstance(group, h5py.Group) else None
                 if not isinstance(data, h5py.Dataset) or (data.size or 0) > 100 * MAX_STEPS:
-                    raise CorruptAssetError(f"{label}: lacks an array 'observations'")
+                    raise CorruptAssetError(
+                        f"{label}: array 'observations' is missing or too large"
+                    )
                 found.append(_checked({"observations": data[()]}, number, label))
     except (OSError, RuntimeError, KeyError) as error:
         raise CorruptAssetError(f"{path}: not readable as HDF5 ({reason(error)})") from error
@@ -104,7 +106,7 @@ def _read_hdf5(path: Path) -> list[Demonstration]:
 
 
 def _number(name: str) -> int | None:
-    """Return the number in the name of an episode's group, or None for any other name."""
+    """Return N for the name ``episode_N`` of an HDF5 group, None for any other name."""
     kind, _, number = name.partition("_")
     return int(number) if kind == "episode" and number.isdecimal() else None
 
