@@ -156,7 +156,7 @@ def study_playbacks(
     boxes: Annotated[int, typer.Option(min=1, help="Objects to try for each run.")] = 100,
     offline: Offline = False,
 ) -> None:
-    """Export and simulate all runs of a task, as in the paper's real-world experiment.
+    """Export and simulate all runs of a task, in place of the paper's real-world experiment.
 
     Each playback is written into its run's folder, and the table also as playbacks.json in DIR.
     """
