@@ -22,7 +22,8 @@ from pgdm.library.files.keyframes import STEP_S, continuous
 ORIGINS = ("com", "mesh")
 
 NEAR_M, NEAR_RAD = 0.01, 0.17
-"""Largest distances between first pose and resting pose that are blended away, with a note."""
+"""Distance between first pose and resting pose up to which the motion is blended to start at rest;
+if they are farther apart, ``--settle`` is needed."""
 _BLEND_STEPS = 15  # control steps of the blend
 _NAME_THEM = (
     "name the columns: a first line x,y,z,qx,qy,qz,qw in a .csv, 'columns' in a .json or .npz"
@@ -62,7 +63,7 @@ class CheckedMotion:
     notes: list[str]
     """Changes, a sentence each."""
     source: str
-    """``animator`` or ``recorded``."""
+    """``trajectory_source`` of the task's file: ``animator`` or ``recorded``."""
 
 
 def make_motion(

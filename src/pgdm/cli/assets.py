@@ -81,8 +81,7 @@ def import_checkout(
 
 @app.command()
 def use(source: Annotated[str, typer.Argument(help=_SOURCE_HELP)]) -> None:
-    """Prefer one source.
-
+    """Prefer one library source.
     Every task in this source is then read from it; existing runs keep the source they recorded.
     """
     _check_present(source)
@@ -134,7 +133,7 @@ def list_tasks() -> None:
         )  # fmt: skip
     table.caption = (
         f"{len(served)} tasks in {paths.library()}; a task is read from the first source listed\n"
-        "expert: whether a human hand trajectory is stored; 'pgdm assets show TASK' measures it"
+        "expert: whether a human hand trajectory is stored; 'pgdm assets show TASK' prints details"
     )
     tables().print(table)
     for source, manifest in manifests.items():

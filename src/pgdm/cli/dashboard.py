@@ -176,7 +176,7 @@ def _wait_until_up(server: subprocess.Popen[bytes], url: str, output: IO[bytes])
 
 
 def _page(url: str) -> str:
-    """Return the address of the latest experiment, or of the list of experiments."""
+    """Return the path, below ``url``, of the page of the latest experiment or of all of them."""
     query = {"max_results": 100, "order_by": ["last_update_time DESC"]}
     found = _asked(f"{url}/api/2.0/mlflow/experiments/search", query).get("experiments", [])
     ours = [str(e["experiment_id"]) for e in found if e.get("name") != "Default"]

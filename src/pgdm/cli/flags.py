@@ -17,7 +17,7 @@ _SHORT = {
     "-sc": "--shell-completion",
 }
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
-# Flags with a value, and its valid values (None: any).
+# Flags that take a value, and the valid values (None: any).
 _VALUES: dict[str, tuple[str, ...] | None] = {
     "--cfg": ("job", "hydra", "all"),
     "--package": None,
@@ -26,7 +26,7 @@ _VALUES: dict[str, tuple[str, ...] | None] = {
 }
 _OURS = ("--help", "--version", "--debug", "--offline", "--dry-run")
 DRY_RUN = "sweep.dry_run=true"
-"""What ``--dry-run`` means in a sweep."""
+"""The override that ``--dry-run`` adds; only sweeps read it."""
 _HYDRAS = ("--multirun", "--resolve", "--hydra-help", "--shell-completion")
 _PRINTING = {"--cfg", "--info", "--resolve", "--hydra-help", "--shell-completion"}
 

@@ -66,7 +66,7 @@ def help_text(config_dir: str | None = None) -> str:
         "Suites (-m task=SUITE, or combined: -m 'task=tcdm30,dhand-*,-dhand-cup')",
         *(_suite(name, file, config_dir, width) for name, file in suites(config_dir).items()),
         "",
-        "Sweep files (+sweep=NAME, or a file of yours: +sweep=PATH.yaml)",
+        "Sweep files (+sweep=NAME, or your own file: +sweep=PATH.yaml)",
         *(_entry(n, _title(file).split(), width, 18) for n, file in studies(config_dir).items()),
         "",
         "Keys of a sweep",

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pgdm.library.progress import StepProgress
     from pgdm.sweep.expand import Composed
 
-# How overrides start that only sweeps read.
+# Prefixes of overrides that only sweeps read.
 _OF_SWEEPS = ("sweep.", "hydra.launcher.", "hydra/launcher=", "hydra.sweeper.")
 
 

@@ -70,13 +70,13 @@ def existing(path: Path | None) -> Path | None:
 
 
 def known_run(path: Path) -> Path:
-    """Reject a path, possibly as `pgdm runs` prints it, that is neither a run nor a checkpoint."""
+    """Return the path of a run or checkpoint, also if given as `pgdm runs` prints it."""
     folder_of(path)
     return located(path)
 
 
 def known_runs(paths: list[Path]) -> list[Path]:
-    """Reject the paths if any of them is neither a run nor a checkpoint."""
+    """Return the paths of runs or checkpoints, as `known_run` does."""
     return [known_run(path) for path in paths]
 
 

@@ -1,4 +1,4 @@
-"""A task's settings, scene and environment, as the commands open them."""
+"""Open a task's settings, scene or environment for a command."""
 
 from __future__ import annotations
 

@@ -211,7 +211,7 @@ def settled(folder: Path, queue: Queue | None = None) -> Ledger:
 
 
 def _continues(found: Sequence[Row]) -> bool:
-    """Return whether jobs run or wait in Slurm, which continues without a driving process."""
+    """Return whether jobs are running or waiting in Slurm, which needs no driving process."""
     return any(row.slurm is not None and row.state in (WAITING, RUNNING) for row in found)
 
 

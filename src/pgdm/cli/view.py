@@ -28,7 +28,7 @@ class View:
     video: Path | None
     """MP4 to write; None: open a window."""
     pregrasp: str
-    """Source of the start."""
+    """Source of the start state."""
     offline: bool
 
     def open(self, *overrides: str) -> EnvBuilder:

@@ -55,9 +55,9 @@ def add_run(
 ) -> Entry | None:
     """Add the last policy of a finished run to a zoo, in half precision if that is accurate enough.
 
-    It is if sampled success and error of the rounded policy are within the 95% intervals of the
-    run's own evaluation (Student's t, over its episodes), or change by no more than a single
-    control step could cause. The evaluation stored with the policy is that of the stored weights.
+    It is accurate enough if sampled success and error of the rounded policy are within the 95%
+    intervals of the run's own evaluation (Student's t, over its episodes), or change by no more
+    than a single control step could cause. The stored evaluation is that of the stored weights.
 
     Args:
         run: folder of the run.

@@ -124,8 +124,8 @@ def _check_equalities(model: mujoco.MjModel, couplings: Couplings, label: str) -
         if number not in couplings.rows:
             kind = mujoco.mjtEq(model.eq_type[number]).name[5:].lower()
             raise ConfigError(
-                f"{label}: has an equality constraint of kind '{kind}'; only constraints that make a "
-                "joint follow another joint are supported, not closed kinematic loops"
+                f"{label}: has an equality constraint of kind '{kind}'; only those by which a "
+                "joint follows another are supported, not closed kinematic loops"
             )
     for follower, leader in zip(couplings.followers, couplings.leaders, strict=True):
         if leader in couplings.followers:

@@ -211,7 +211,7 @@ def make_task(
 ) -> None:
     """Make a task from an object, a hand and a motion.
 
-    pgdm-run task=ID then trains it.
+    Train it with pgdm-run task=ID.
     """
     own.check_task_name(task, suites(), replace)
     library = open_library()

@@ -94,7 +94,7 @@ def _found(made: AuthoredHand) -> list[tuple[str, str]]:
         ("side", made.side),
         ("fingers", f"{fingers}; found by {found.found_by}"),
         ("wrist", f"{len(found.wrist_joints)} joints move the palm"),
-        ("servos", f"gain {', '.join(f'{g:g}' for g in gains)}; {given} as in the file"),
+        ("servos", f"gain {', '.join(f'{g:g}' for g in gains)}; {given} with the file's gain"),
         ("reset", f"all joints at zero{f', but {moved}' if moved else ''}"),
     ]
     if made.source.mimics:

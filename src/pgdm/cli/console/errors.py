@@ -106,7 +106,7 @@ def guarded(command: Callable[[], int], debug: bool) -> int:
 
 
 def _open_streams() -> None:
-    """Replace standard streams that were closed (``>&-``), lest files get their descriptors."""
+    """Replace closed standard streams (``>&-``), so that no file gets their descriptors."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 (it stays open)

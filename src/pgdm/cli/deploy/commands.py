@@ -72,7 +72,7 @@ def export_playback(
         str | None,
         typer.Option(
             metavar="'X Y TURN'",
-            help="Arm's base in the world: x and y, m, and yaw, degrees [the hand's default].",
+            help="Arm's base in the world: x, y, m, and turn (yaw), degrees [the hand's default].",
             callback=_numbers(3, "x y turn"),
         ),
     ] = None,

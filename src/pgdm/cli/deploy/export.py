@@ -75,7 +75,7 @@ def run_export(request: ExportRequest, cfg: ConvertCfg, place: Place) -> int:
 
 
 def converted(request: ExportRequest, cfg: ConvertCfg, place: Place) -> Converted:
-    """Roll the policy of a run out and convert its best episode.
+    """Roll out the policy of a run, and convert its best episode.
 
     Raises:
         PgdmError: as for `run_export`.

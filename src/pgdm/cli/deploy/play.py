@@ -18,7 +18,7 @@ def run_play(file: Path, robot: str | None, move: bool, realtime: bool) -> int:
     """Check a playback, connect, and move the arm if asked to; return the exit code.
 
     Raises:
-        PgdmError: if the file is not a playback or exceeds the arm's limits, or the arm refuses it.
+        PgdmError: if the file is not a playback or exceeds the arm's limits, or the arm rejects it.
     """
     playback = read(file)
     check_playable(playback)

@@ -28,7 +28,17 @@ from pgdm.pregrasp.reach.plan import ReachPlan, measure
 from pgdm.pregrasp.reach.planner import plan_reach
 from pgdm.sim.scene import Scene
 
-_HEADS = ("task", "hand", "source", "free", "deep mm", "fingertips mm", "palm deg", "lift", "reach")
+_HEADS = (
+    "task",
+    "hand",
+    "source",
+    "free",
+    "penetration mm",
+    "fingertips mm",
+    "palm deg",
+    "lift",
+    "reach",
+)
 _NUMBERS = 4, 5, 6, 7  # columns of numbers
 
 
@@ -115,7 +125,7 @@ def _rows(
 
 
 def _stored(scene: Scene, motion: Motion, sources: Sequence[str]) -> list[_Checked]:
-    """Return a task's pre-grasps for this hand; the user's replace the library's of equal source.
+    """Return a task's pre-grasps for this hand; the user's replace the library's of that source.
 
     Raises:
         ConfigError: if one of the sources is missing.
@@ -135,13 +145,13 @@ def _stored(scene: Scene, motion: Motion, sources: Sequence[str]) -> list[_Check
         own = pregrasp_file.find(task, hand, name)
         assert own is not None
         found[name] = _own(own, pregrasp_file.path_of(task, hand, name))
-    if "mined" in found and "planned" in found:  # also replaces a published plan
+    if "mined" in found and "planned" in found:  # the user's own plan, if any
         found["mined"] = dataclasses.replace(found["mined"], plan=found["planned"].plan)
     missing = [source for source in sources if source not in found]
     if missing or not found:
         raise ConfigError(
             f"task '{task}' has no pre-grasp {' or '.join(missing)} for hand '{hand}'; it has: "
-            f"{', '.join(found) or 'none'}. 'pgdm pregrasp --help' lists how to make one"
+            f"{', '.join(found) or 'none'}. 'pgdm pregrasp --help' shows how to make one"
         )
     return [found[name] for name in (sources or found)]
 

@@ -71,7 +71,7 @@ def check(
         bool, typer.Option("--reach", help="Plan a reach to pre-grasps that have none.")
     ] = False,
     policies: Annotated[
-        int, typer.Option(min=1, help="Random closing policies of the lift test.")
+        int, typer.Option(min=1, help="Number of random closing policies in the lift test.")
     ] = 32,
     seed: Annotated[int, typer.Option(min=0, help="Seed of lift test and reach plan.")] = 0,
     json_file: Annotated[
@@ -82,7 +82,7 @@ def check(
 ) -> None:
     """Measure how good pre-grasps are.
 
-    Tests contact, distance of the fingertips, angle of the palm, lift test and reach.
+    Measures penetration, fingertip distance, palm angle, lift rate, and errors of the reach.
     """
     with loading():
         from pgdm.cli.pregrasp.check import Request, run
@@ -133,8 +133,7 @@ def teleop(
         int | None,
         typer.Option(
             min=0,
-            help="Index of the demonstration, from 0; by default that whose object is nearest to "
-            "the task's.",
+            help="Index of the demonstration, from 0 [that with the object nearest to the task's].",
         ),
     ] = None,
     reach: _Reach = True,
@@ -221,7 +220,7 @@ def train(
 def predict(
     task: Task,
     hand: Hand = None,
-    samples: Annotated[int, typer.Option(min=1, help="Candidates to lift-test.")] = 8,
+    samples: Annotated[int, typer.Option(min=1, help="Number of candidates to lift-test.")] = 8,
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of samples, lift test and reach plan.")
     ] = 0,

@@ -21,7 +21,7 @@ from pgdm.pregrasp.reach.plan import ReachPlan
 from pgdm.pregrasp.reach.planner import REACH, plan_reach
 from pgdm.sim.scene import Scene
 
-_HEADS = ("task", "result", "base mm", "rad", "fingers rad", "object mm", "deep mm", "steps", "s")
+_HEADS = ("task", "result", "base mm", "rad", "fingers rad", "object mm", "depth mm", "steps", "s")
 
 
 @dataclass(frozen=True)

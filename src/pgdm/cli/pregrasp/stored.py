@@ -39,7 +39,7 @@ def report(path: Path, scene: Scene) -> None:
 
 
 def report_with_reach(path: Path, image: Path | None, pregrasp: Pregrasp, scene: Scene) -> None:
-    """Print a pre-grasp's reach and where it is stored; draw it if a picture is wanted."""
+    """Print a pre-grasp's reach and where it is stored; draw both if ``image`` is given."""
     reach = pregrasp.note.get("reach")
     if reach:
         print(
