@@ -131,7 +131,7 @@ def _firmest(scene: Scene, poses: list[NearPose], progress: StepProgress) -> Fou
 
 
 def _base_over(scene: Scene, poses: Poses) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function from qpos (nq,) to excess (T, B) of base joints over range and slack."""
+    """Return a function of qpos (nq,): excess (T, B) of base joints over range + slack, m, rad."""
     reference = ObjectReference(torch.from_numpy(poses.pos), torch.from_numpy(poses.quat))
     low, high = scene.model.jnt_range[: scene.index.num_base_joints].T
     slack = np.array([SLACK_M] * _SLIDES + [SLACK_RAD] * (len(low) - _SLIDES))
