@@ -158,7 +158,7 @@ def test_fingers_without_names_are_found_by_geometry_or_asked_for() -> None:
     few = {name: link for name, link in chosen.items() if name != "ring"}
     with pytest.raises(ConfigError, match=r"--fingers must name every finger, .* lacks 'chain1_2'"):
         author_hand(request(Path("hand.urdf"), name="x", fingers=few))
-    with pytest.raises(ConfigError, match=r"index=nolink names no finger .* 'chain2_2'"):
+    with pytest.raises(ConfigError, match=r"index=nolink does not identify .* 'chain2_2'"):
         author_hand(request(Path("hand.urdf"), name="x", fingers={"index": "nolink"}))
     made = author_hand(request(Path("hand.urdf"), name="asked", fingers=chosen))
     assert made.anatomy.found_by == "--fingers"
@@ -269,7 +269,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     ),
     "ball": (
         mjcf().replace('<joint name="ring_j0" axis="0 1 0" range="-6 90"/>', '<joint name="ring_j0" type="ball" range="0 90"/>').replace('<position name="ring_a0" joint="ring_j0" kp="2" kv=".05" ctrlrange="-.08 1.4"/>', "").replace("<keyframe>", "<!--").replace("</keyframe>", "-->"),  # noqa: E501
-        "joint 'ring_j0' is no hinge or slide",
+        "joint 'ring_j0' is not a hinge or slide",
     ),
     "plugin": (mjcf(extra='<extension><plugin plugin="x"/></extension>'), "has <extension>"),
     "includes itself": (mjcf(extra='<include file="hand.xml"/>'), "includes itself"),

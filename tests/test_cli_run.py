@@ -408,7 +408,7 @@ def test_resume_writes_to_no_store_that_a_folder_names(library_home: Path, tmp_p
     file = Path("runs/a/config.yaml")
     file.write_text(file.read_text().replace("uri: null", f"uri: {theirs}"))
     on = command("pgdm", "resume", "runs/a", "--total-frames", "64", "--offline")
-    assert on.code == 0 and f"--uri {theirs} mirrors it there" in " ".join(on.err.split())
+    assert on.code == 0 and f"add --uri {theirs} to mirror the run" in " ".join(on.err.split())
     assert not any((tmp_path / "theirs").iterdir())
     on = command("pgdm", "resume", "runs/a", "--total-frames", "96", "--offline", "--uri", theirs)
     assert on.code == 0 and (tmp_path / "theirs" / "mlflow.db").is_file()

@@ -41,10 +41,10 @@ def test_runs_are_compared() -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["runs/a"], "1 run is named; name at least two different ones"),
+        (["runs/a"], "1 run is named; name at least two different runs"),
         (["runs/a", "runs/../runs/a"], "1 run is named"),
         (["runs/a", "runs/nothing"], "no run folder or checkpoint 'runs/nothing'"),
-        (["runs/a", "runs/b", "--image", "x.jpg"], "--image 'x.jpg' is no PNG"),
+        (["runs/a", "runs/b", "--image", "x.jpg"], "--image 'x.jpg' is not a PNG"),
     ],
 )
 def test_what_cannot_be_compared(words: list[str], said: str) -> None:

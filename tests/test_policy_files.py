@@ -255,4 +255,4 @@ def test_commands_say_what_fits(tmp_path: Path) -> None:
     policy = replace(tiny(), name="a")
     tensors.write(tmp_path / "a.safetensors", tensors.pack(policy, None, card(policy)))
     outcome = command("pgdm", "eval", str(tmp_path / "a.safetensors"), "--task", "cup-pour1")
-    assert outcome.code == 2 and "are for a zip of Stable-Baselines3" in outcome.err
+    assert outcome.code == 2 and "are for .zip files of Stable-Baselines3" in outcome.err

@@ -1,4 +1,4 @@
-"""The motion of a new task: read, mended on request, checked, started where the object rests."""
+"""The motion of a new task: read it, repair it on request, start it at rest, and check it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from pgdm.library.files.keyframes import STEP_S, continuous
 ORIGINS = ("com", "mesh")
 
 NEAR_M, NEAR_RAD = 0.01, 0.17
-"""Largest distance between first pose and resting pose that is blended away, with a note."""
+"""Distance between first pose and resting pose up to which the motion is blended to start at rest;
+if they are farther apart, ``--settle`` is needed."""
 _BLEND_STEPS = 15  # control steps of the blend
 _NAME_THEM = (
     "name the columns: a first line x,y,z,qx,qy,qz,qw in a .csv, 'columns' in a .json or .npz"
@@ -42,7 +43,7 @@ class MotionRequest:
     poses: Path | None
     """Recorded poses: .csv, .npz or .json."""
     origin: str = "com"
-    """Point whose positions were recorded: ``com``, or ``mesh``, the origin of the mesh's file."""
+    """Point whose positions were recorded: ``com`` or ``mesh``, the mesh file's origin."""
     smooth: bool = False
     """Filter the motion, and start and end it at rest."""
     slower: float = 1.0
@@ -58,11 +59,11 @@ class CheckedMotion:
     """A motion that passed all checks."""
 
     poses: Poses
-    """The first is where the object rests."""
+    """The motion; in its first pose the object rests on the table."""
     notes: list[str]
     """Changes, a sentence each."""
     source: str
-    """``animator`` or ``recorded``."""
+    """``trajectory_source`` of the task's file: ``animator`` or ``recorded``."""
 
 
 def make_motion(
@@ -74,17 +75,20 @@ def make_motion(
         request: where the motion comes from.
         object_xml: the object's model.
         model: the task's scene.
-        body: id of the object's body in it.
+        body: id of the object's body in the scene.
 
     Raises:
-        ConfigError: no hand could carry the object so; the message names the pose and a remedy.
-        CorruptAssetError: its file is damaged.
+        ConfigError: the options exclude each other, or the motion is impossible; the message then
+            names the pose and a remedy.
+        CorruptAssetError: the motion's file is damaged.
     """
     if (request.keyframes is None) == (request.poses is None):
         raise ConfigError("a task needs one motion: --keyframes FILE or --poses FILE")
     check_name("origin", request.origin, ORIGINS)
     if request.keyframes is not None and request.origin != "com":
-        raise ConfigError(f"--origin {request.origin} is for --poses; keyframes give the com")
+        raise ConfigError(
+            f"--origin {request.origin} is for --poses; keyframes state the centre of mass"
+        )
     notes: list[str] = []
     if request.keyframes is not None:
         poses, label = _animated(request.keyframes, object_xml, notes), str(request.keyframes)
@@ -147,7 +151,7 @@ def _recorded(
 def _started_at_rest(
     poses: Poses, settle: bool, object_xml: Path, label: str, notes: list[str]
 ) -> Poses:
-    """Return the motion with its first pose where the object rests on the table."""
+    """Return the motion, shifted or blended so that in its first pose the object rests."""
     first = Rotation.from_quat(poses.quat[0], scalar_first=True)
     place = float(poses.pos[0, 0]), float(poses.pos[0, 1])
     if max(abs(place[0]), abs(place[1])) > _TABLE_M:

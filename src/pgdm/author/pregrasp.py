@@ -26,11 +26,11 @@ from pgdm.wrist.path import carried_path
 CHOICES = ("mean", "open", "later")
 
 SLACK_M, SLACK_RAD = 0.03, 0.2
-"""How far the base, with the hand moving rigidly with the object, may leave its range: the fingers
-and the policy's corrections compensate for that much."""
+"""How far a base joint may leave its range when the hand moves rigidly with the object: fingers
+and the policy's corrections can compensate for that much."""
 _TOUCH_M = 1e-4
 _SLIDES = 3  # the first joints of the base
-_HAND_M = 0.3  # how much less than a turning object the base may have to travel
+_HAND_M = 0.3  # if the object turns, the base may have to travel this much less
 _CURE = "shorten the motion, or put the object elsewhere (place in the keyframes)"
 _COMPARED = 5  # poses that are lift-tested
 
@@ -58,15 +58,16 @@ def make_pregrasp(
     Args:
         choice: ``mean`` or ``open`` (a search with the fingers near that posture), ``later`` (the
             hand's reset pose), a pre-grasp's file, or a task (a search near its finger pose).
-        scene: the new task's.
-        qpos: whole scene (nq,), the object where it rests.
+        scene: scene of the new task.
+        qpos: positions of the whole scene (nq,), with the object at rest.
         poses: the task's motion.
         library: library with the other tasks' pre-grasps.
         progress: reports search and lift tests.
 
     Raises:
-        ConfigError: there is no such pre-grasp, it does not fit, or the hand cannot follow.
-        SceneError: every pose that was found touches something.
+        ConfigError: there is no such pre-grasp, it does not fit, or the hand cannot follow the
+            motion.
+        SceneError: every pose that the search found touches something.
     """
     if choice == "later":
         note = "no pre-grasp yet: episodes start from the hand's reset pose"
@@ -91,16 +92,16 @@ def make_pregrasp(
             f"the hand cannot follow the motion: moving rigidly with the object, joint "
             f"{scene.model.joint(int(joint)).name} would leave its range by "
             f"{excess[row, joint]:.2f} {'m' if joint < _SLIDES else 'rad'} more than a policy can "
-            f"compensate for, most in row {row}; {_CURE}"
+            f"compensate for, most at step {row}; {_CURE}"
         )
     return found
 
 
 def _check_travel(scene: Scene, poses: Poses) -> None:
-    """Check that the base could carry the object that far, before a pose is searched.
+    """Check that the base's slides are long enough for the motion, before a pose is searched.
 
     Raises:
-        ConfigError: it could not, from any pose.
+        ConfigError: they are too short, whatever the pre-grasp.
     """
     travel = np.ptp(poses.pos @ mount_rotation(scene), axis=0)
     low, high = scene.model.jnt_range[:_SLIDES].T
@@ -130,7 +131,7 @@ def _firmest(scene: Scene, poses: list[NearPose], progress: StepProgress) -> Fou
 
 
 def _base_over(scene: Scene, poses: Poses) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of qpos (nq,): how far each base joint leaves its range, (T, B) m, rad."""
+    """Return a function of qpos (nq,): excess (T, B) of base joints over range + slack, m, rad."""
     reference = ObjectReference(torch.from_numpy(poses.pos), torch.from_numpy(poses.quat))
     low, high = scene.model.jnt_range[: scene.index.num_base_joints].T
     slack = np.array([SLACK_M] * _SLIDES + [SLACK_RAD] * (len(low) - _SLIDES))
@@ -161,7 +162,7 @@ def _from_file(path: Path, scene: Scene, qpos: np.ndarray) -> FoundPregrasp:
 
 
 def _fingers(choice: str, scene: Scene, library: Library) -> np.ndarray:
-    """Return finger joint positions (J,) rad that the search should stay close to."""
+    """Return finger joint positions (J,), rad, to which the search should stay close."""
     first = scene.hand.num_base_joints + scene.hand.num_wrist_joints
     if choice == "open":
         return np.zeros(scene.index.num_joints - first)

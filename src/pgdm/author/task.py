@@ -1,4 +1,4 @@
-"""A task of the user's own: its motion in the library, its file in the user's settings."""
+"""Tasks of the user's: the motion is kept in the library, the settings in the user's folder."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from pgdm.pregrasp.sources import is_reset_pose, reset_pose
 from pgdm.sim.scene import Scene, build_scene
 
 _BOUND = {o for task in ("door-open", "hammer-strike") for o in objects_of(task)}
-"""Objects that belong to one task: they are attached, or consist of several bodies."""
+"""Objects that only fit their own task: attached to the scene, or made of several bodies."""
 
 
 @dataclass(frozen=True)
 class TaskRequest:
-    """What to make a task of."""
+    """A task to create."""
 
     id: str
     """Id of the new task."""
     object: str
-    """Library name of its object, the user's own or the benchmark's."""
+    """Library name of the object, the user's or the benchmark's."""
     hand: str
-    """Name of its hand."""
+    """Name of the hand."""
     motion: MotionRequest
     pregrasp: str = "mean"
     """See :func:`pgdm.author.pregrasp.make_pregrasp`."""
@@ -73,15 +73,17 @@ def task_path(task: str) -> Path:
 def author_task(
     request: TaskRequest, library: Library, progress: StepProgress = silent
 ) -> AuthoredTask:
-    """Make a task of the user's own for ``pgdm-run task=ID``, and plan its reach.
+    """Make a task for ``pgdm-run task=ID``, and plan its reach.
 
     Args:
-        request: what to make it of.
+        request: the task to create.
         library: library with the object, the hand and the table.
         progress: reports the search for a pre-grasp, its lift tests and the reach plan.
 
     Raises:
-        ConfigError: a name is unknown or taken, or no hand can carry the object so.
+        ConfigError: a name is unknown or taken, the motion is impossible, or the hand cannot follow
+            it.
+        SceneError: every pre-grasp that the search found touches something.
         CorruptAssetError: a file is damaged.
         LibraryError: the user's folder cannot be written.
     """
@@ -120,7 +122,7 @@ def author_task(
 
 
 def task_scene(request: TaskRequest, library: Library) -> Scene:
-    """Compile the scene of a task that is not stored yet; the library promises its motion."""
+    """Compile the scene of a task that is not stored yet; see ``Library.promising``."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "task" / f"{request.id}.yaml"
         file.parent.mkdir()
@@ -133,7 +135,7 @@ def remove_task(task: str) -> Path | None:
     """Remove a task of the user's: its motion and its file.
 
     Returns:
-        The folder that keeps its pre-grasps, or None if there are none.
+        The folder to which its pre-grasps were moved, or None if it had none.
 
     Raises:
         UnknownNameError: the user has no such task.

@@ -40,5 +40,5 @@ def view_ablations(view: View, image: Path | None) -> None:
 def _described(ablated: Ablated, wanted_m: float) -> str:
     parts = [f"penetration {1e3 * ablated.depth_m:.1f} mm"]
     if ablated.distance_m > ablated.retreat_m:
-        parts.append(f"hand {1e2 * ablated.distance_m:.1f} cm off")
+        parts.append(f"hand {1e2 * ablated.distance_m:.1f} cm away")
     return ", ".join(filter(None, (*parts, ablated.compromises(wanted_m))))

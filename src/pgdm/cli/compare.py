@@ -19,11 +19,11 @@ def compare_runs(runs: Sequence[Path], image: Path) -> None:
 
     Raises:
         ConfigError: if fewer than two different runs are named.
-        RunError: if one is not a run, or cannot be read.
+        RunError: if a path is not a run, or a run cannot be read.
     """
     folders = list(dict.fromkeys(folder_of(path).resolve() for path in runs))
     if len(folders) < 2:
-        raise ConfigError(f"{len(folders)} run is named; name at least two different ones")
+        raise ConfigError(f"{len(folders)} run is named; name at least two different runs")
     found = Comparison([RunFolder(folder) for folder in folders])
     changes = found.differences()
     _print("setting", found.names, {k: list(map(_shown, v)) for k, v in changes.items()})
@@ -41,7 +41,7 @@ def _print(what: str, names: Sequence[str], rows: Mapping[str, Sequence[str]]) -
     for name in (what, *names):
         table.add_column(Text(name), overflow="fold")
     for name, values in rows.items():
-        table.add_row(*map(Text, (name, *values)))  # brackets are no markup
+        table.add_row(*map(Text, (name, *values)))  # Text: brackets in values are not markup
     tables().print(table)
     print()
 

@@ -1,4 +1,4 @@
-"""``pgdm dashboard``: MLflow's pages on a folder of runs, for this machine only."""
+"""``pgdm dashboard``: MLflow's web pages for a folder of runs, served to this machine only."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ HOST = "127.0.0.1"
 START_S = 120.0
 _STOP_S = 5.0
 _VIEW = "pgdm"
-"""Name of the view of the runs' table."""
+"""Name under which MLflow stores which columns the table of runs shows."""
 _COLUMNS = [
     "metrics.`eval_sampled/success`",
     "metrics.`train/steps_per_s`",
@@ -47,7 +47,7 @@ _STOPPERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 def dashboard(
     root: Runs = None,
-    port: Annotated[int, typer.Option(help="Port; if it is taken, another one is used.")] = 5000,
+    port: Annotated[int, typer.Option(help="Port; if it is taken, another is used.")] = 5000,
     uri: Annotated[
         str | None, typer.Option(help="Another MLflow store, such as sqlite:////data/x.db.")
     ] = None,
@@ -103,15 +103,15 @@ def _command(uri: str, root: Path, port: int) -> list[str]:
     # This interpreter has MLflow, whether its environment is activated or not.
     command = [sys.executable, "-m", "mlflow", "server", "--host", HOST, "--port", str(port)]
     command += ["--backend-store-uri", uri, "--workers", "1", "--no-serve-artifacts"]
-    # By default MLflow also answers to names such as 10.evil.example, which lead here if their
-    # owner wants; the browser would let that site read the runs.
+    # By default MLflow also accepts host names such as 10.evil.example. Its owner can resolve it
+    # to this machine (DNS rebinding), and the browser would let that site read the runs.
     command += ["--allowed-hosts", ",".join((HOST, f"{HOST}:*", "localhost", "localhost:*"))]
     return [*command, "--default-artifact-root", str(root / ARTIFACTS)]
 
 
 @contextlib.contextmanager
 def _served(command: list[str], output: IO[bytes]) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the server; stop it and its children however this process stops."""
+    """Run the server; stop it and its children however the with block ends."""
     env = {**environment(), "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
     with on_stop(_stop):
         server = subprocess.Popen(
@@ -120,7 +120,7 @@ def _served(command: list[str], output: IO[bytes]) -> Iterator[subprocess.Popen[
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            start_new_session=True,  # a group of its own: signals reach its workers, not us
+            start_new_session=True,  # a new group: signals reach its workers, not this process
         )
         try:
             yield server
@@ -132,7 +132,7 @@ def _served(command: list[str], output: IO[bytes]) -> Iterator[subprocess.Popen[
 
 @contextlib.contextmanager
 def on_stop(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Handle the signals that stop a program, while inside."""
+    """Call a handler on SIGINT, SIGTERM and SIGHUP within the with block."""
     before = {number: signal.signal(number, handler) for number in _STOPPERS}
     try:
         yield
@@ -142,7 +142,7 @@ def on_stop(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
 
 
 class _StopError(Exception):
-    """A signal to stop has come."""
+    """A stop signal has arrived."""
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
@@ -160,7 +160,7 @@ def _kill(server: subprocess.Popen[bytes]) -> None:
 
 
 def _wait_until_up(server: subprocess.Popen[bytes], url: str, output: IO[bytes]) -> None:
-    notify(f"starting MLflow's server, and waiting for its answer at {url}")
+    notify(f"starting MLflow's server and waiting for it to answer at {url}")
     begin = time.monotonic()
     with bars() as progress:
         while (waited_s := time.monotonic() - begin) < START_S:
@@ -176,13 +176,13 @@ def _wait_until_up(server: subprocess.Popen[bytes], url: str, output: IO[bytes])
 
 
 def _page(url: str) -> str:
-    """Return the address of the latest experiment, or of the list of experiments."""
+    """Return the path, below ``url``, of the page of the latest experiment or of all of them."""
     query = {"max_results": 100, "order_by": ["last_update_time DESC"]}
     found = _asked(f"{url}/api/2.0/mlflow/experiments/search", query).get("experiments", [])
     ours = [str(e["experiment_id"]) for e in found if e.get("name") != "Default"]
     if not ours:
         return "/#/experiments?workflowType=machine_learning"
-    # The page reads the columns to show from a tag that its own button "Share" would set.
+    # The page reads the columns to show from a tag that its "Share" button would set.
     view = json.dumps({"selectedColumns": _COLUMNS})
     tag = {"experiment_id": ours[0], "key": f"mlflow.sharedViewState.{_VIEW}", "value": view}
     _asked(f"{url}/api/2.0/mlflow/experiments/set-experiment-tag", tag)
@@ -191,7 +191,7 @@ def _page(url: str) -> str:
 
 
 def _asked(address: str, content: dict[str, Any]) -> dict[str, Any]:
-    """Return what MLflow answers; empty if it does not."""
+    """Return MLflow's answer to a request; empty if there is none."""
     headers = {"Content-Type": "application/json"}
     request = urllib.request.Request(address, json.dumps(content).encode(), headers)
     try:

@@ -1,4 +1,4 @@
-"""``pgdm doctor``: what this machine has of what pgdm uses, and what to do about the rest."""
+"""``pgdm doctor``: check what pgdm needs on this machine, and say how to fix what is missing."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ class Check(NamedTuple):
 
     subject: str
     sound: bool | None
-    """Whether it works; None: it does not, and few people need it."""
+    """Whether it works; None: it does not, but is optional."""
     found: str
-    """What is there, or what to do."""
+    """What was found, or what to do."""
 
 
 def diagnose() -> int:
     """Print the table; return 1 if something that every run needs does not work."""
     table = Table(box=None, header_style="bold")
-    for name in ("subject", "", "what is there, or what to do"):
+    for name in ("subject", "", "what was found, or what to do"):
         table.add_column(name, overflow="fold")
     sound = True
     with bars(patience_s=2.0) as progress:
@@ -64,12 +64,12 @@ def _rendering() -> Iterator[Check]:
     from pgdm.sim import gl
 
     try:
-        gl.backends()  # whether it is switched off
+        gl.backends()  # raises an error if rendering is switched off
         backend = gl.context_class().__module__.rpartition(".")[2]
-    except PgdmError as error:  # runs go on without videos
+    except PgdmError as error:  # optional: runs work without videos
         yield Check("rendering", None, str(error))
     else:
-        yield Check("rendering", True, f"{backend}: videos need no screen")
+        yield Check("rendering", True, f"{backend}: videos are rendered without a display")
 
 
 def _machine() -> Iterator[Check]:
@@ -119,7 +119,7 @@ def _store() -> Iterator[Check]:
         yield Check("MLflow store", False, f"{error}; or unset {VARIABLE}")
         return
     there = importlib.util.find_spec("mlflow") is not None
-    yield Check("MLflow store", there, store if there else "install mlflow, or tracking=none")
+    yield Check("MLflow store", there, store if there else "install mlflow, or use tracking=none")
 
 
 def _slurm() -> Iterator[Check]:
@@ -131,13 +131,13 @@ def _slurm() -> Iterator[Check]:
     try:
         nodes = output(["sinfo", "--noheader", "--format=%P %D %T"]).split("\n")
     except PgdmError as error:
-        yield Check("Slurm", None, f"it does not answer; sweeps run on this machine ({error})")
+        yield Check("Slurm", None, f"sinfo failed; sweeps run on this machine ({error})")
     else:
         yield Check("Slurm", True, f"{'; '.join(filter(None, nodes))}: hydra/launcher=slurm")
 
 
 def _existing(folder: os.PathLike[str]) -> str:
-    """Return a folder, or the nearest one above it that exists."""
+    """Return a folder, or its nearest parent that exists."""
     path = os.path.abspath(folder)
     while not os.path.isdir(path):
         path = os.path.dirname(path)

@@ -34,10 +34,11 @@ class EvalRequest:
 def evaluate_policy(request: EvalRequest) -> int:
     """Print a policy's metrics and return the exit code.
 
-    It is 1 if a stored result is not reproduced, the signal's if one stopped it, otherwise 0.
+    The code is 1 if a stored result is not reproduced, that of a stop signal if one arrived,
+    otherwise 0.
 
     Raises:
-        PgdmError: if the policy is missing, damaged or of another environment.
+        PgdmError: if the policy is missing or damaged, or does not fit its environment.
     """
     policy = open_policy(request.policy)
     cfg = policy.cfg
@@ -67,14 +68,14 @@ def evaluate_policy(request: EvalRequest) -> int:
 
 def _compared(stored: Mapping[str, float], now: Mapping[str, float]) -> int:
     """Print whether metrics are the stored ones, and return the exit code."""
-    # NaN, of metrics that do not apply, is not stored.
+    # Metrics that do not apply are NaN, and are not stored.
     changed = [name for name, value in stored.items() if now.get(name) != value]
     if not changed:
-        print(f"stored result: reproduced, all {len(stored)} numbers to the bit")
+        print(f"stored result: reproduced, all {len(stored)} numbers are bit-identical")
         return 0
     success = "eval_sampled/success"
     print(
         f"stored result: not reproduced, {len(changed)} of {len(stored)} numbers differ; sampled "
-        f"success was {stored.get(success, float('nan')):.2%}, is {now[success]:.2%}"
+        f"success was {stored.get(success, float('nan')):.2%}, is now {now[success]:.2%}"
     )
     return 1

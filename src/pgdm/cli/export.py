@@ -47,7 +47,7 @@ def export(request: ExportRequest) -> int:
     """Write a policy and return the exit code.
 
     Raises:
-        PgdmError: if the policy cannot be read, its task not be compiled, or the file not be
+        PgdmError: if the policy cannot be read, its task does not compile, or a file cannot be
             written.
     """
     check_installed(f"--format {request.form}", *_PACKAGES.get(request.form, ()))
@@ -82,7 +82,7 @@ def _file(request: ExportRequest, policy: TrainedPolicy) -> Path:
     path = request.out or Path(policy.cfg.task.id + ending)
     if path.suffix != ending:
         raise ConfigError(
-            f"--out '{path}' is no file for {request.form}; give a name that ends in {ending}"
+            f"--out '{path}' does not fit {request.form}; give a name that ends in {ending}"
         )
     return path
 

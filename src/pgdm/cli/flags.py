@@ -17,7 +17,7 @@ _SHORT = {
     "-sc": "--shell-completion",
 }
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
-# Flags with a value, and its valid values (None: any).
+# Flags that take a value, and the valid values (None: any).
 _VALUES: dict[str, tuple[str, ...] | None] = {
     "--cfg": ("job", "hydra", "all"),
     "--package": None,
@@ -26,23 +26,23 @@ _VALUES: dict[str, tuple[str, ...] | None] = {
 }
 _OURS = ("--help", "--version", "--debug", "--offline", "--dry-run")
 DRY_RUN = "sweep.dry_run=true"
-"""What ``--dry-run`` means in a sweep."""
+"""The override that ``--dry-run`` adds; only sweeps read it."""
 _HYDRAS = ("--multirun", "--resolve", "--hydra-help", "--shell-completion")
 _PRINTING = {"--cfg", "--info", "--resolve", "--hydra-help", "--shell-completion"}
 
 
 @dataclass
 class Flags:
-    """A command line, sorted."""
+    """A parsed command line."""
 
     ours: set[str] = field(default_factory=set)
-    """Those of ``_OURS`` that were given."""
+    """The flags of ``_OURS`` that were given."""
     hydras: list[str] = field(default_factory=list)
-    """Flags for Hydra, in its own form."""
+    """Flags that are passed on to Hydra, and their values."""
     overrides: list[str] = field(default_factory=list)
     """The overrides: ``key=value``."""
     typed: list[str] = field(default_factory=list)
-    """Those that were typed; the others are from a sweep file."""
+    """Overrides that do not come from a sweep file; ``pgdm.cli.run`` sets this."""
     config_dir: str | None = None
     """The user's own settings folder."""
 
@@ -53,12 +53,12 @@ class Flags:
 
     @property
     def prints(self) -> bool:
-        """Whether Hydra prints something instead of a run."""
+        """Whether Hydra only prints something and nothing is run."""
         return not _PRINTING.isdisjoint(self.hydras)
 
 
 def read_flags(arguments: Sequence[str]) -> Flags:
-    """Sort a command line.
+    """Parse a command line.
 
     Raises:
         ConfigError: if a flag is unknown, or lacks its value.

@@ -25,8 +25,8 @@ Examples
   pgdm-run +experiment=fast task=cup-pour1     the same task in 300,000 frames
   pgdm-run task=hammer-use1 total_frames=200_000 run_dir=out/a seed=3
   pgdm-run -m task=duck-lift,cup-pour1 seed=0,1,2     a sweep of six runs
-  pgdm-run -m 'task=tcdm30,dhand-*' --dry-run  what a sweep over suites would do
-  pgdm-run +sweep=validate_tcdm50 budget=smoke a study of the paper, briefly
+  pgdm-run -m 'task=tcdm30,dhand-*' --dry-run  show the plan of a sweep over suites
+  pgdm-run +sweep=validate_tcdm50 budget=smoke a short version of a study
   pgdm-run task=cup-pour1 --cfg job            print all settings, start nothing
   the same command again, or pgdm resume RUN   resumes a stopped run
 """
@@ -36,8 +36,8 @@ Flags
   -m, --multirun     a sweep: one run for each combination of values a,b,c
   --dry-run          show a sweep's plan, or the terms of one run; start nothing
   --offline          never use the network; missing assets are an error
-  --config-dir DIR   also your own settings: DIR/task/mine.yaml is task=mine
-  --cfg job          print all settings (--resolve: with references filled in)
+  --config-dir DIR   add your own settings: DIR/task/mine.yaml is task=mine
+  --cfg job          print all settings (--resolve: with references resolved)
   --info [WHAT]      where settings come from: config, defaults, searchpath, ...
   --debug            show the traceback of an error, and log more
   -h, --help         this text          --hydra-help   flags of Hydra
@@ -49,7 +49,7 @@ Exit codes: 0 done, 1 failed, 2 wrong settings, 130 or 143 stopped by a signal
 
 
 def help_text(config_dir: str | None = None) -> str:
-    """Return the help, with the options of the user's own settings folder too."""
+    """Return the help, including options from the user's settings folder ``config_dir``."""
     width = min(shutil.get_terminal_size().columns, 100)
     config = describe(conf_dir() / "config.yaml")
     lines = [_HEAD, "Groups (GROUP=OPTION; * is the default)"]
@@ -66,7 +66,7 @@ def help_text(config_dir: str | None = None) -> str:
         "Suites (-m task=SUITE, or combined: -m 'task=tcdm30,dhand-*,-dhand-cup')",
         *(_suite(name, file, config_dir, width) for name, file in suites(config_dir).items()),
         "",
-        "Sweep files (+sweep=NAME, or a file of yours: +sweep=PATH.yaml)",
+        "Sweep files (+sweep=NAME, or your own file: +sweep=PATH.yaml)",
         *(_entry(n, _title(file).split(), width, 18) for n, file in studies(config_dir).items()),
         "",
         "Keys of a sweep",

@@ -1,4 +1,4 @@
-"""What a command line asks to be run: one experiment, or every job of a sweep."""
+"""The runs that a command line asks for: one experiment, or all jobs of a sweep."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
     from pgdm.library.progress import StepProgress
     from pgdm.sweep.expand import Composed
 
-# What only a sweep reads.
+# Prefixes of overrides that only sweeps read.
 _OF_SWEEPS = ("sweep.", "hydra.launcher.", "hydra/launcher=", "hydra.sweeper.")
 
 
 @dataclass
 class Asked:
-    """What a command line asks to be run."""
+    """The runs that a command line asks for."""
 
     jobs: list[Composed] = field(default_factory=list)
-    """Overrides and settings of each; none if Hydra only printed something."""
+    """Overrides and settings of each run; empty if Hydra only printed something."""
     is_sweep: bool = False
     launcher_choice: str = ""
-    """Which launcher starts the jobs of a sweep."""
+    """Name of the launcher that starts the jobs of a sweep."""
     launcher: Any = None
-    """Its settings, as plain containers."""
+    """The launcher's settings, as plain dicts and lists."""
 
 
 def read_jobs(flags: Flags, progress: StepProgress) -> Asked:
@@ -59,7 +59,7 @@ def read_jobs(flags: Flags, progress: StepProgress) -> Asked:
         if key == "hydra/sweeper" and value != "pgdm":
             raise UnknownNameError("hydra/sweeper of pgdm", value, ["pgdm"])
     if flags.prints:
-        if "--shell-completion" not in flags.hydras:  # its words are no settings
+        if "--shell-completion" not in flags.hydras:  # its arguments are not overrides
             composer.whole(flags.overrides, flags.multirun)
         _print(composer, flags)
         return Asked()
@@ -73,7 +73,7 @@ def _single(composer: Composer, flags: Flags) -> Asked:
     _offer(composer.whole(flags.overrides, typed=flags.typed))
     settings = composer.plain(flags.overrides)
     stray = [override for override in flags.overrides if override.startswith(_OF_SWEEPS)]
-    if "--dry-run" in flags.ours:  # of one run, it shows the run's terms
+    if "--dry-run" in flags.ours:  # allowed for a single run: it shows the run's terms
         stray.remove(DRY_RUN)
     if stray:
         raise ConfigError(f"'{stray[0]}' is for sweeps; add -m, or leave it out")
@@ -92,7 +92,8 @@ def _sweep(composer: Composer, flags: Flags, progress: StepProgress) -> Asked:
     _offer(whole)
     most = whole.sweep.get("most_jobs")
     check_at_least("sweep.most_jobs", most if isinstance(most, int) else 0, 1)
-    # Hydra's way to write a sweep down; what is typed comes after it, and so wins.
+    # hydra.sweeper.params holds the sweep values of settings files; overrides come after them
+    # and take precedence.
     written = [f"{key}={value}" for key, value in whole.hydra.sweeper.params.items()]
     own = [str(o.input_line) for o in composer.parse(overrides) if not o.is_hydra_override()]
     folder = None if flags.config_dir is None else Path(flags.config_dir)
@@ -105,14 +106,14 @@ def _sweep(composer: Composer, flags: Flags, progress: StepProgress) -> Asked:
 
 
 def _offer(whole: DictConfig) -> None:
-    """Let settings refer to Hydra's own, as in ``run_dir=${hydra:runtime.cwd}/out``."""
+    """Let settings refer to Hydra's settings, as in ``run_dir=${hydra:runtime.cwd}/out``."""
     from hydra.core.hydra_config import HydraConfig
 
     HydraConfig.instance().set_config(whole)
 
 
 def _print(composer: Composer, flags: Flags) -> None:
-    """Have an application of Hydra's own print what its flags ask for."""
+    """Start an empty Hydra application, which prints what Hydra's flags ask for and exits."""
     import hydra
 
     from pgdm.config.groups import conf_dir
@@ -127,7 +128,7 @@ def _print(composer: Composer, flags: Flags) -> None:
 
 @contextmanager
 def _hydra_command_line(flags: Flags) -> Iterator[None]:
-    """Show Hydra a command line of its own, and have it raise errors instead of printing them."""
+    """Set ``sys.argv`` to what Hydra should read, and let it raise errors instead of printing."""
     from pgdm.config.groups import own_folders
 
     overrides = flags.overrides

@@ -35,7 +35,7 @@ from pgdm.cli.options import (
 from pgdm.cli.pregrasp import commands as pregrasp
 from pgdm.errors import ConfigError
 
-# click's ClickException; newer versions of typer contain a copy of their own.
+# click's ClickException, or the copy of it that newer versions of typer contain.
 _WRONG_USAGE: type[Exception] = typer.BadParameter.mro()[2]
 
 app = typer.Typer(
@@ -106,25 +106,25 @@ def _options(
         ),
     ] = False,
 ) -> None:
-    del debug, version  # main and the callback have read them
+    del debug, version  # handled in main and in _print_version
 
 
 @app.command("eval")
 def evaluate(
     policy: Policy,
     episodes: Annotated[
-        int | None, typer.Option(min=1, help="Number of episodes; by default that of the run.")
+        int | None, typer.Option(min=1, help="Number of episodes; by default as in the run.")
     ] = None,
     video: Annotated[
         bool, typer.Option("--video", help="Also make a video of the policy.")
     ] = False,
     deterministic: Annotated[
-        bool, typer.Option("--deterministic", help="Measure only the mean action, without noise.")
+        bool, typer.Option("--deterministic", help="Evaluate only the mean action, without noise.")
     ] = False,
     best: Best = False,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Seed of the noise; by default that of the run."),
+        typer.Option(min=0, help="Seed of the action noise; by default the run's."),
     ] = None,
     task: ZipTask = None,
     settings: ZipSettings = None,
@@ -133,7 +133,7 @@ def evaluate(
 ) -> None:
     """Evaluate a trained policy.
 
-    A video of a run's policy goes into the run's folder, of any other into the current one.
+    The video is written to the run's folder, or to the current folder if the policy is not a run's.
     """
     with loading():
         from pgdm.cli.evaluate import EvalRequest, evaluate_policy
@@ -152,7 +152,7 @@ def export_policy(
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="torchscript, onnx, safetensors, or minari: episodes of the policy.",
+            help="torchscript, onnx, safetensors, or minari (a dataset of the policy's episodes).",
             callback=one_of("--format", lambda: EXPORTS),
         ),
     ],
@@ -160,24 +160,24 @@ def export_policy(
         Path | None,
         typer.Option(
             metavar="PATH",
-            help="File to write, or minari's folder of datasets [TASK with the format's ending; "
-            "datasets].",
+            help="File to write [TASK plus the format's ending]; minari: the folder of datasets "
+            "[datasets].",
         ),
     ] = None,
     scene: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Also write the scene for plain MuJoCo into a new folder."
+            metavar="FOLDER", help="Also write the scene, for plain MuJoCo, to this new folder."
         ),
     ] = None,
     episodes: Annotated[
         int | None, typer.Option(min=1, help="Only minari: number of episodes [25].")
     ] = None,
     deterministic: Annotated[
-        bool, typer.Option("--deterministic", help="Only minari: take the mean action, no noise.")
+        bool, typer.Option("--deterministic", help="Only minari: use the mean action, no noise.")
     ] = False,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Only minari: seed of the noise [that of the run].")
+        int | None, typer.Option(min=0, help="Only minari: seed of the noise [the run's].")
     ] = None,
     best: Best = False,
     task: ZipTask = None,
@@ -201,7 +201,8 @@ def export_policy(
 def resume(
     run: Run,
     total_frames: Annotated[
-        int | None, typer.Option(metavar="N", help="Train for this many frames, more than so far.")
+        int | None,
+        typer.Option(metavar="N", help="New total length in frames, more than trained so far."),
     ] = None,
     time_limit_min: Annotated[
         float | None,
@@ -253,11 +254,11 @@ def view(
     hand: Hand = None,
     expert: Annotated[
         bool,
-        typer.Option("--expert", help="Move the hand as a person moved; spheres show contacts."),
+        typer.Option("--expert", help="Play the recorded human hand; spheres mark contacts."),
     ] = False,
     reach: Annotated[
         bool,
-        typer.Option("--reach", help="Play the reach that brings the hand to its pre-grasp."),
+        typer.Option("--reach", help="Play the reach from the reset pose to the pre-grasp."),
     ] = False,
     wrist: Annotated[
         bool, typer.Option("--wrist", help="Play the wrist plan: the hand alone, no object.")

@@ -1,4 +1,4 @@
-"""Options that several commands have, checked before torch and the simulator load."""
+"""Options shared by several commands; values are checked before torch and MuJoCo are loaded."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Check = Callable[[str | None], str | None]
 
 
 def one_of(kind: str, names: Callable[[], Iterable[str]]) -> Check:
-    """Return a callback that refuses every name but some."""
+    """Return a callback that rejects a name that is not in ``names()``."""
 
     def check(name: str | None) -> str | None:
         if name is not None:
@@ -47,7 +47,7 @@ def _task_or_none(name: str | None) -> str | None:
 
 
 def tasks_or_files(words: list[str]) -> list[str]:
-    """Refuse words that are neither tasks, suites or patterns nor ``.npz`` files."""
+    """Reject words that are neither tasks, suites, patterns nor existing ``.npz`` files."""
     expand_tasks(word for word in words if not word.endswith(".npz"))
     for word in words:
         if word.endswith(".npz"):
@@ -56,37 +56,37 @@ def tasks_or_files(words: list[str]) -> list[str]:
 
 
 def known_sources(names: list[str] | None) -> list[str] | None:
-    """Refuse the sources of pre-grasps that do not exist."""
+    """Reject unknown pre-grasp sources."""
     for name in names or ():
         _known_source(name)
     return names
 
 
 def existing(path: Path | None) -> Path | None:
-    """Refuse the path of an input that does not exist."""
+    """Reject the path of an input file or folder that does not exist."""
     if path is not None and not path.exists():
         raise ConfigError(f"there is no file '{path}'; check the path")
     return path
 
 
 def known_run(path: Path) -> Path:
-    """Refuse a path that is neither a run nor a checkpoint; a run may be named as in a list."""
+    """Return the path of a run or checkpoint, also if given as `pgdm runs` prints it."""
     folder_of(path)
     return located(path)
 
 
 def known_runs(paths: list[Path]) -> list[Path]:
-    """Refuse paths of which one is no run."""
+    """Return the paths of runs or checkpoints, as `known_run` does."""
     return [known_run(path) for path in paths]
 
 
 EXPORTS = ("torchscript", "onnx", "safetensors", "minari")
 POLICY_FILES = (".safetensors", ".xz", ".zip")
-"""Endings of files that hold a policy, besides the checkpoints of runs."""
+"""Suffixes of files that hold a policy, other than the checkpoints of runs."""
 
 
 def known_policy(text: str) -> str:
-    """Refuse what is neither a run, a checkpoint, a file with a policy, nor in the zoo."""
+    """Reject a text that names neither a run, a checkpoint, a policy file nor a zoo entry."""
     if text.startswith(PREFIX):
         Zoo().entry(text.removeprefix(PREFIX))
     elif Path(text).suffix.lower() in POLICY_FILES:
@@ -100,7 +100,7 @@ def _ending(suffix: str, kind: str) -> Callable[[typer.CallbackParam, Path | Non
     def check(param: typer.CallbackParam, path: Path | None) -> Path | None:
         if path is not None and path.suffix.lower() != suffix:
             raise ConfigError(
-                f"--{param.name} '{path}' is no {kind}; give a name that ends in {suffix}"
+                f"--{param.name} '{path}' is not {kind}; give a name that ends in {suffix}"
             )
         return path
 
@@ -108,12 +108,12 @@ def _ending(suffix: str, kind: str) -> Callable[[typer.CallbackParam, Path | Non
 
 
 def complete_task(incomplete: str) -> list[str]:
-    """Return the tasks that begin with what was typed, for the shell."""
+    """Return the tasks that begin with the typed text, for shell completion."""
     return [name for name in available("task") if name.startswith(incomplete)]
 
 
 def complete_tasks(incomplete: str) -> list[str]:
-    """Return the tasks and suites that begin with what was typed, for the shell."""
+    """Return the tasks and suites that begin with the typed text, for shell completion."""
     names = (*available("task"), *suites())
     return [name for name in names if name.startswith(incomplete)]
 
@@ -150,7 +150,7 @@ Hand = Annotated[
 Start = Annotated[
     str | None,
     typer.Option(
-        help="Start of the hand, as in pgdm-run [planned].",
+        help="Start state of the hand, as pregrasp= of pgdm-run [planned].",
         callback=_option("pregrasp"),
         autocompletion=_completing("pregrasp"),
     ),
@@ -166,37 +166,37 @@ Video = Annotated[
     Path | None,
     typer.Option(
         help="Write an MP4 to this file instead of opening a window.",
-        callback=_ending(".mp4", "MP4"),
+        callback=_ending(".mp4", "an MP4"),
     ),
 ]
-check_image = _ending(".png", "PNG")
+check_image = _ending(".png", "a PNG")
 Image = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Also draw it into this PNG.", callback=check_image),
+    typer.Option(metavar="FILE", help="Also draw the result to this PNG.", callback=check_image),
 ]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", callback=known_run)]
 Policy = Annotated[
     str,
     typer.Argument(
         metavar="POLICY",
-        help="Folder of a run, one of its checkpoints, zoo:NAME (pgdm zoo list), a .safetensors of "
-        "pgdm export, or a .zip of Stable-Baselines3's PPO.",
+        help="Folder of a run, one of its checkpoints, zoo:NAME (see pgdm zoo list), .safetensors "
+        "file from pgdm export, or .zip file from Stable-Baselines3's PPO.",
         callback=known_policy,
     ),
 ]
 Best = Annotated[
-    bool, typer.Option("--best", help="Use the checkpoint of highest success, not the last.")
+    bool, typer.Option("--best", help="Use the checkpoint with the highest success, not the last.")
 ]
 ZipTask = Annotated[
     str | None,
-    typer.Option("--task", help="Task of a .zip, which does not name it.", callback=_task_or_none),
+    typer.Option("--task", help="Only .zip: task it was trained on.", callback=_task_or_none),
 ]
 ZipSettings = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Setting of pgdm-run with which a .zip was trained [the paper's].",
+        help="Only .zip: pgdm-run setting it was trained with [the paper's]; can be repeated.",
     ),
 ]
 ZipStatistics = Annotated[
@@ -204,7 +204,7 @@ ZipStatistics = Annotated[
     typer.Option(
         "--vecnormalize",
         metavar="FILE",
-        help="File of VecNormalize that belongs to a .zip.",
+        help="Only .zip: its saved VecNormalize statistics.",
         callback=existing,
     ),
 ]

@@ -1,4 +1,4 @@
-"""A sweep before it starts: planned, shown, and passed to its launcher."""
+"""Plan a sweep, print the plan, and pass it to the launcher."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def run_planned(asked: Asked, name: str, command: str) -> int:
     """Plan a sweep, show the plan, carry it out, and return the exit code.
 
     Args:
-        asked: its jobs.
-        name: its name if ``sweep.name`` has none.
-        command: what was typed.
+        asked: the sweep's jobs and launcher.
+        name: the sweep's name if ``sweep.name`` is null.
+        command: the command line that was typed.
 
     Raises:
         PgdmError: if a job's settings are wrong, or the sweep's folder holds another sweep.
@@ -60,7 +60,7 @@ def _show(plan: Plan, cost: Estimate) -> None:
     for key, value in _rows(plan, cost):
         table.add_row(key, value)
     tables().print(table, markup=False)
-    # Not through rich: a path must stay whole on its line.
+    # Not printed with rich, which would wrap a long path.
     print(f"folder: {plan.folder}")
 
 
@@ -94,7 +94,7 @@ def _rows(plan: Plan, cost: Estimate) -> list[tuple[str, str]]:
         ("frames", f"{lengths} a job, {total:,} in all, {cost.frames_left:,} left"),
         (
             "time",
-            f"about {span(3600 * cost.hours)} of training, one job after the other at {source}",
+            f"about {span(3600 * cost.hours)} of training if jobs run one by one at {source}",
         ),
         *(replay if disk else []),
     ]

@@ -1,4 +1,4 @@
-"""Policies as commands name them: a run, a checkpoint, a file, or an entry of the zoo."""
+"""Open the policy that a command names: of a run, a checkpoint, a file, or the zoo."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from pgdm.zoo.policy import open_entry
 
 @dataclass(frozen=True)
 class PolicyRequest:
-    """Which policy is meant."""
+    """The policy that a command names."""
 
     text: str
-    """A run's folder, a checkpoint in one, a file of ``POLICY_FILES``, or ``zoo:NAME``."""
+    """A run's folder, one of its checkpoints, a file as in ``POLICY_FILES``, or ``zoo:NAME``."""
     best: bool = False
     """Whether to take the best checkpoint of a run folder instead of the last."""
     task: str | None = None
     """Only ``.zip``: the task that it was trained on."""
     settings: tuple[str, ...] = ()
-    """Only ``.zip``: settings of the training which differ from the paper's."""
+    """Only ``.zip``: settings of the training that differ from the paper's."""
     vecnormalize: Path | None = None
     """Only ``.zip``: file of a ``VecNormalize``."""
     zoo: Zoo | None = None
@@ -33,10 +33,10 @@ class PolicyRequest:
 
 
 def open_policy(request: PolicyRequest) -> TrainedPolicy:
-    """Return the policy that is meant.
+    """Return the requested policy.
 
     Raises:
-        PgdmError: if there is none, or it cannot be read; or if an option does not fit.
+        PgdmError: if the policy is missing or cannot be read, or an option is not for its kind.
     """
     if request.text.startswith(PREFIX):
         if request.best or request.task or request.settings or request.vecnormalize:
@@ -46,7 +46,9 @@ def open_policy(request: PolicyRequest) -> TrainedPolicy:
     kind = path.suffix.lower() if path.is_file() or path.suffix.lower() in POLICY_FILES else ""
     is_zip = kind == ".zip"
     if not is_zip and (request.task or request.settings or request.vecnormalize):
-        raise ConfigError("--task, --set and --vecnormalize are for a zip of Stable-Baselines3")
+        raise ConfigError(
+            "--task, --set and --vecnormalize are for .zip files of Stable-Baselines3"
+        )
     if kind not in POLICY_FILES:
         return of_run(known_run(path), request.best)
     if request.best:

@@ -52,7 +52,7 @@ def _main(flags: Flags, command: str, debug: bool) -> int:
         if (settings.get("method") or {}).get("name") in named:
             trust_method(settings)
         check_method(settings, "a settings file")
-    # Only here: they load the simulator and torch, and a wrong name is answered before that.
+    # Imported this late because they load MuJoCo and torch; wrong names are reported before that.
     if asked.is_sweep:
         with loading():
             from pgdm.cli.plan import run_planned

@@ -47,7 +47,8 @@ _COLUMNS = {
 }
 
 
-# In a narrow terminal the first of these are left out; each run's name, below it, has most of them.
+# Columns that a narrow terminal leaves out, in this order; the run's name, which is then printed
+# below its row, contains most of these values.
 _NEEDLESS = ("action", "algo", "start", "method", "steps/s", "lifted", "error", "when", "seed")
 
 
@@ -70,15 +71,20 @@ Where = Annotated[
     list[str] | None,
     typer.Option(
         metavar="COLUMN=VALUE",
-        help="List only runs like task=cup* or status=failed; can be repeated.",
+        help="List only matching runs, as in task=cup* or status=failed; can be repeated.",
     ),
 ]
 Sort = Annotated[
     str,
-    typer.Option(metavar="COLUMN", help="Sort by it, the largest last; -COLUMN: first."),
+    typer.Option(
+        metavar="COLUMN", help="Sort by this column, largest last; -COLUMN: largest first."
+    ),
 ]
 Limit = Annotated[
-    int | None, typer.Option("--limit", "-n", min=1, help="List only the N largest, or latest.")
+    int | None,
+    typer.Option(
+        "--limit", "-n", min=1, help="List only the N largest or, sorted by time, latest."
+    ),
 ]
 
 
@@ -184,7 +190,7 @@ def row(folder: RunFolder, root: Path) -> dict[str, Any]:
 
 
 def _key(column: str) -> str:
-    """Return the key in a row of a column, by its head or by the key itself.
+    """Return a column's key in a row, given the column's heading or the key itself.
 
     Raises:
         UnknownNameError: if there is no such column.
@@ -197,7 +203,7 @@ def _key(column: str) -> str:
 
 
 def _matcher(where: Sequence[str]) -> Callable[[dict[str, Any]], bool]:
-    """Return whether a row has the values that texts such as ``task=cup*`` demand."""
+    """Return a function that says whether a row meets conditions such as ``task=cup*``."""
     wanted = []
     for text in where:
         column, equals, value = text.partition("=")
@@ -210,7 +216,7 @@ def _matcher(where: Sequence[str]) -> Callable[[dict[str, Any]], bool]:
 
 
 def _order(sort: str) -> Callable[[dict[str, Any]], Any]:
-    """Return what rows are sorted by; those without the value come first."""
+    """Return the sort key of rows; rows without the value come first."""
     key = _key(sort.removeprefix("-"))
 
     def order(found: dict[str, Any]) -> tuple[bool, bool, Any]:
@@ -240,7 +246,7 @@ def _print(rows: list[dict[str, Any]]) -> None:
     console.print(Text.from_ansi(head))
     for line, values in itertools.zip_longest(lines, rows, fillvalue=None):
         console.print(Text.from_ansi(line or ""))
-        if values:  # uncut: to be copied into a command
+        if values:  # not through rich, which would cut the name: it is copied into commands
             print(f"  {values['run']}", flush=True)
 
 

@@ -1,4 +1,4 @@
-"""A task's settings, scene and environment, as the commands open them."""
+"""Open a task's settings, scene or environment for a command."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class Opened(NamedTuple):
 
 
 def composed(task: str, hand: str | None, *overrides: str, offline: bool = False) -> ExperimentCfg:
-    """Return the settings of a task with its own hand or another."""
+    """Return the settings of a task, with another hand if one is given."""
     chosen = [f"hand={hand}"] if hand else []
     return compose([f"task={task}", *chosen, *overrides, f"offline={str(offline).lower()}"])
 
 
 def open_scene(cfg: ExperimentCfg, progress: StepProgress | None = None) -> Opened:
-    """Compile the scene of a task; fetches its assets if they are missing.
+    """Compile the scene of a task, after fetching its assets if they are missing.
 
     Raises:
         PgdmError: if the assets cannot be fetched or the scene does not compile.
@@ -45,7 +45,7 @@ def open_env(cfg: ExperimentCfg, origins: object = None) -> EnvBuilder:
 
     Args:
         cfg: the experiment.
-        origins: sources of the assets that a run recorded; see `Library.serving`.
+        origins: asset sources that a run recorded; see `Library.serving`.
 
     Raises:
         PgdmError: if an asset, the start or the wrist plan is missing and cannot be made.

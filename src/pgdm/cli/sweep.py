@@ -55,14 +55,14 @@ FRONT = Front(
     worker=worker.COMMAND,
     resume=(sys.executable, "-m", "pgdm", "sweep", "resume"),
 )
-"""What every sweep gets of the command line."""
+"""What sweeps use from the command line: messages, a display, worker and resume commands."""
 
 app = typer.Typer(help="Follow, stop and resume sweeps.", no_args_is_help=True)
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the sweep.")]
 Jobs = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[JOB]...", help="Jobs, by a part of their name or by their key."),
+    typer.Argument(metavar="[JOB]...", help="Jobs, by part of their name or by their key."),
 ]
 Detach = Annotated[bool, typer.Option("--detach", help="Run in the background.")]
 
@@ -74,7 +74,7 @@ def status(
 ) -> None:
     """Show each job and the whole sweep.
 
-    Of each job: state, frames, success, attempts, time left.
+    A row per job: state, frames, success, attempts, time left.
     """
     queue = Queue()
     ledger = settled(folder, queue)
@@ -89,7 +89,7 @@ def status(
     print(summary_line(ledger.fact(NAME) or folder.name, summary))
     left = [row for row in found if row.state in (WAITING, INTERRUPTED) and row.slurm is None]
     if parent(ledger) is None and left:
-        print(f"no process drives it; pgdm sweep resume {folder} continues")
+        print(f"no process drives the sweep; pgdm sweep resume {folder} resumes it")
 
 
 @app.command()
@@ -115,9 +115,9 @@ def watch(folder: Folder) -> None:
 @app.command()
 def logs(
     folder: Folder,
-    job: Annotated[str, typer.Argument(metavar="JOB", help="A part of its name, or its key.")],
+    job: Annotated[str, typer.Argument(metavar="JOB", help="Part of the job's name, or its key.")],
     follow: Annotated[
-        bool, typer.Option("-f", "--follow", help="Follow it until the job ends.")
+        bool, typer.Option("-f", "--follow", help="Keep printing until the job ends.")
     ] = False,
 ) -> None:
     """Print the output of a job's last attempt."""
@@ -129,7 +129,7 @@ def logs(
         raise SweepError(f"{entry.name} has not been started yet")
     with TextIOWrapper(files.open_file(path), errors="replace") as log:
         while True:
-            # Queried before reading, so that its last output is not missed.
+            # The state is queried before reading, so that the job's last output is not missed.
             continues = follow and any(
                 r.key == entry.key and r.state == RUNNING for r in rows(ledger, queue)
             )
@@ -142,7 +142,7 @@ def logs(
 
 @app.command()
 def cancel(folder: Folder, jobs: Jobs = None) -> None:
-    """Stop jobs, or all that are not finished; running ones save first."""
+    """Stop the named jobs, or all unfinished ones; running jobs save first."""
     queue = Queue(_ASK_S)
     ledger = settled(folder, queue)
     ended = (FINISHED, FAILED) if not jobs else (FINISHED,)
@@ -157,17 +157,17 @@ def cancel(folder: Folder, jobs: Jobs = None) -> None:
     limit = time.monotonic() + _STOP_S
     while any(row.state == RUNNING and row.key in keys for row in rows(ledger, queue)):
         if time.monotonic() > limit:
-            raise SweepError(f"not all have stopped yet; see pgdm sweep status {folder}")
+            raise SweepError(f"not all jobs have stopped yet; see pgdm sweep status {folder}")
         time.sleep(_POLL_S)
-    print(f"cancelled {len(chosen)} jobs; pgdm sweep resume {folder} would resume them")
+    print(f"cancelled {len(chosen)} jobs; pgdm sweep resume {folder} resumes them")
 
 
 @app.command()
 def retry(folder: Folder, jobs: Jobs = None) -> None:
     """Retry failed jobs.
 
-    Named jobs instead, if any, unless they have finished. They run here, or in the process that
-    drives the sweep.
+    Named jobs are retried whatever their state, unless running or finished. Jobs run in this
+    process, or in the one that already drives the sweep.
     """
     ledger = settled(folder)
     wanted = _chosen(ledger, jobs)
@@ -187,7 +187,7 @@ def retry(folder: Folder, jobs: Jobs = None) -> None:
 def resume(folder: Folder, detach: Detach = False) -> None:
     """Resume unfinished jobs.
 
-    The settings are those that the sweep was started with.
+    They run with the settings that the sweep was started with.
     """
     settled(folder)
     raise typer.Exit(_resume(folder, detach=detach))
@@ -211,7 +211,7 @@ def settled(folder: Path, queue: Queue | None = None) -> Ledger:
 
 
 def _continues(found: Sequence[Row]) -> bool:
-    """Return whether Slurm runs jobs of a sweep, or will, without a driver."""
+    """Return whether jobs are running or waiting in Slurm, which needs no driving process."""
     return any(row.slurm is not None and row.state in (WAITING, RUNNING) for row in found)
 
 
@@ -219,8 +219,8 @@ def _chosen(ledger: Ledger, jobs: Sequence[str] | None) -> list[Entry]:
     """Return the named jobs; all if none is named.
 
     Raises:
-        UnknownNameError: if a text is in no job's name.
-        SweepError: if it is in several.
+        UnknownNameError: if a text matches no job.
+        SweepError: if a text matches several jobs.
     """
     entries = ledger.entries()
     return entries if not jobs else [_one(entries, text) for text in jobs]

@@ -40,12 +40,15 @@ def print_tasks(tcdm30: bool) -> None:
 
 
 def _cells(name: str, file: Path) -> list[str]:
-    """Return a task's row but for the library, from its file: composing it takes far longer."""
+    """Return a task's row without the column ``library``.
+
+    The row is read from the task's file, since composing the settings takes far longer.
+    """
     description = describe(file)
     value = {key.name: key.value for key in description.keys}
     hands = [option for key, option in description.defaults.items() if "/hand" in key]
     success = value.get("paper_success", "null")
-    # A user's own file may build on another one and leave out its keys.
+    # A user's file may extend another file and omit its keys.
     return [
         value.get("id", name),
         hands[0] if hands else "",

@@ -9,9 +9,9 @@ from pgdm.mdp.shaping import shaped
 from pgdm.methods import recipe
 
 RECORDED_AS = """\
-recorded under train/, eval_sampled/ and eval_deterministic/: a reward summed over the episode as
-raw/NAME and, weighted, term/NAME; a termination as end/NAME; a measure, mean over the episode, as
-NAME. A weight with a schedule: train/weight/NAME."""
+recorded under train/, eval_sampled/ and eval_deterministic/: each reward, summed over the episode,
+as raw/NAME and, weighted, as term/NAME; each termination as end/NAME; each measure, averaged over
+the episode, as NAME. Weights that follow a schedule are recorded as train/weight/NAME."""
 
 
 def term_table(cfg: ExperimentCfg) -> Table:

@@ -1,4 +1,4 @@
-"""One run, as the user watches it."""
+"""Start or resume a single run, and print its progress and result."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def train(cfg: ExperimentCfg, patient: bool = False) -> int:
     Progress goes to stderr, the result to stdout.
 
     Args:
-        cfg: the run.
-        patient: whether further signals after the first are ignored.
+        cfg: settings of the run.
+        patient: whether to ignore stop signals after the first.
 
     Raises:
         PgdmError: if the run fails.
@@ -71,11 +71,12 @@ def resume_run(
     """Resume a run with the settings in its folder, and return the exit code.
 
     Args:
-        run: its folder, or a file in it.
+        run: the run's folder, or a file in it.
         total_frames: new length; None: as before.
-        time_limit_min: new limit; None: as before, 0: none.
+        time_limit_min: new limit, min; None: as before, 0: no limit.
         uri: MLflow store to mirror the run to; None: that of ``MLFLOW_TRACKING_URI`` or the one
-            beside the run. What the folder names is not written to: somebody else may have made it.
+            next to the run. The store named in the folder's settings is not used, since somebody
+            else may have made the folder.
         offline: whether missing assets are an error instead of being fetched.
 
     Raises:
@@ -86,7 +87,10 @@ def resume_run(
     cfg = load_config(folder_of(run))
     named = cfg.tracking.uri
     if named and not uri and not is_own(named, Path(cfg.run_dir)):
-        notify(f"the run's folder names the MLflow store {named}; --uri {named} mirrors it there")
+        notify(
+            f"the run's settings name the MLflow store {named}; add --uri {named} to mirror the "
+            "run there"
+        )
     limit = cfg.time_limit_min if time_limit_min is None else time_limit_min or None
     cfg = dataclasses.replace(
         cfg,
@@ -109,7 +113,7 @@ def _show(cfg: ExperimentCfg, result: RunResult) -> None:
         )
     screen = console()
     screen.print(summary_table(cfg, result))
-    # Not through rich: a path must stay whole on its line.
+    # Not printed with rich, which would wrap a long path.
     print(f"run:    {result.run_dir}")
     if result.video is not None:
         print(f"video:  {result.video}")

@@ -1,4 +1,4 @@
-"""``pgdm view``: a task's exemplar motion, its reach, its wrist plan, or the expert's hand."""
+"""``pgdm view``: show a task's exemplar motion, reach, wrist plan or expert hand."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pgdm.sim.motion_states import expert_marks, expert_qpos, motion_qpos
 
 @dataclass(frozen=True)
 class View:
-    """Which task to view, and where; a window is opened or an MP4 written."""
+    """Which task to view, and whether in a window or as an MP4."""
 
     task: str
     hand: str | None
@@ -28,7 +28,7 @@ class View:
     video: Path | None
     """MP4 to write; None: open a window."""
     pregrasp: str
-    """Source of the start."""
+    """Source of the start state."""
     offline: bool
 
     def open(self, *overrides: str) -> EnvBuilder:
@@ -36,7 +36,7 @@ class View:
         return open_env(composed(self.task, self.hand, *overrides, offline=self.offline))
 
     def open_at_start(self, *overrides: str) -> EnvBuilder:
-        """Compile it with the hand at the chosen start."""
+        """Compile the task's environment with the hand at the chosen start."""
         return self.open(f"pregrasp={self.pregrasp}", *overrides)
 
     def show(self, builder: EnvBuilder, clip: Clip) -> None:
@@ -56,7 +56,7 @@ class View:
 def view_task(view: View) -> None:
     """Replay the exemplar motion with the hand at its pre-grasp; nothing is simulated.
 
-    If the tracked body has six joints of its own the object itself moves, else only its ghost.
+    The object itself moves only if its tracked body has six joints; otherwise only its ghost does.
 
     Raises:
         PgdmError: if the task is unknown, its assets are missing, or nothing can be drawn.
@@ -85,7 +85,7 @@ def view_reach(view: View) -> None:
 
 
 def view_wrist(view: View) -> None:
-    """Play how the planned wrist commands move the hand alone, and print how closely it follows.
+    """Play the hand alone under the planned base commands, and print how closely it follows.
 
     Raises:
         PgdmError: if the task is unknown, its assets are missing, the hand's base cannot follow a
@@ -114,11 +114,12 @@ def view_expert(view: View) -> None:
     if motion not in MOCAP_TASKS:
         hint = "Only motion-capture tasks have one."
         raise UnknownNameError("expert hand trajectory", motion, MOCAP_TASKS, hint)
-    # The recorded pose is that of the mesh's origin: only so do the fingers touch where they did.
+    # The recorded poses are those of the mesh's origin; without the correction of the reference the
+    # fingers would not touch the object where the person's did.
     builder = view.open("method=graff", "pregrasp=mined", "reference=com_corrected")
     scene, mdp, expert = builder.scene, builder.mdp, builder.expert
     assert expert is not None and mdp.expert is not None  # the method needs one
-    # As published, not clipped to the limits: what the person did, not what the robot can do.
+    # Joint positions as published, not clipped to the robot's limits: the person's own motion.
     qpos = expert_qpos(scene, mdp.start.qpos, mdp.reference, expert.qpos)
     title = "expert hand, rebuilt: approximate" if expert.approximate else "expert hand"
     captions = _numbered(scene.task.id, title, len(qpos))

@@ -1,4 +1,4 @@
-"""``python -m pgdm.cli.worker``: one attempt at one job of a sweep, as a process of its own."""
+"""``python -m pgdm.cli.worker``: the process of one attempt at a job of a sweep."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from pgdm.config.schema import ExperimentCfg
 
 COMMAND = (sys.executable, "-m", "pgdm.cli.worker")
-"""How it is started; the arguments of ``main`` follow."""
+"""The command that starts a worker; the arguments of ``main`` are appended."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Work on a job, and return the exit code of its run.
 
     Args:
-        argv: folder of the sweep, key of the job, number of the attempt, threads for a job that
-            does not set them itself, and Slurm's ID of the job that this is, if it is one.
+        argv: folder of the sweep, key of the job, number of the attempt, threads for a job whose
+            settings do not fix them and, under Slurm, the ID of the Slurm job.
     """
     folder, key, number, threads, *slurm = sys.argv[1:] if argv is None else argv
     slurm_id = slurm[0] if slurm else None

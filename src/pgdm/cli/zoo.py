@@ -14,7 +14,7 @@ from pgdm.errors import ConfigError, check_name
 
 app = typer.Typer(
     name="zoo",
-    help="Trained policies: list them, fetch them, repeat their results.",
+    help="Trained policies: list them, fetch them, reproduce their results.",
     no_args_is_help=True,
 )
 
@@ -108,9 +108,9 @@ def evaluate(
     place: Place = None,
     offline: Offline = False,
 ) -> None:
-    """Evaluate policies anew, and compare with the stored results.
+    """Evaluate policies again, and compare with the stored results.
 
-    The exit code is 1 if one of them is not reproduced to the bit.
+    The exit code is 1 if a result is not reproduced bit-identically.
     """
     from pgdm.zoo import Zoo
 
@@ -127,6 +127,6 @@ def evaluate(
         request = PolicyRequest(f"{PREFIX}{name}", zoo=zoo)
         code = evaluate_policy(EvalRequest(request, None, False, False, None, offline))
         worst = max(worst, code)
-        if code > 1:  # stopped
+        if code > 1:  # stopped by a signal
             break
     raise typer.Exit(worst)

@@ -1,4 +1,4 @@
-"""Where a zoo is, and what is in it: a folder or an address with an index and a file per entry."""
+"""A zoo's location and index: a folder or a web address, with an index and one file per entry."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pgdm.errors import ConfigError, ZooError, check_name
 INDEX, FORMAT = "index.json", "pgdm-zoo-1"
 ENDING = ".safetensors.xz"
 PREFIX = "zoo:"
-"""What distinguishes the name of an entry from a path."""
+"""Marks the name of an entry where a path is also possible, as in ``zoo:hammer-use1``."""
 VARIABLE = "PGDM_ZOO"
 """Environment variable: folder or address of the zoo."""
 MOST_BYTES = 1 << 26
@@ -43,7 +43,7 @@ _KINDS: Mapping[str, tuple[type, ...]] = {
 
 @dataclass(frozen=True)
 class Entry:
-    """What the index has on one policy."""
+    """The index's record of one policy."""
 
     task: str
     hand: str
@@ -54,21 +54,21 @@ class Entry:
     frames: int
     """Length of the training, environment steps."""
     success: float
-    """Of the sampled policy (0..1)."""
+    """Success of the sampled policy (0..1)."""
     deterministic: float
     """Success of the mean action (0..1)."""
     com_error_released: float
-    """Of the sampled policy, m."""
+    """Error of the sampled policy, released form, m."""
     precision: str
-    """Of the stored weights, ``float16`` or ``float32``."""
+    """Precision of the stored weights, ``float16`` or ``float32``."""
     bytes: int
     """Size of the file."""
     sha256: str
-    """Of the file."""
+    """SHA-256 of the file."""
 
 
 class Zoo:
-    """A zoo, read without running anything from it.
+    """A zoo; reading it executes no code from it.
 
     Args:
         place: folder, or address that starts with ``http://`` or ``https://``; None: that of
@@ -117,11 +117,11 @@ class Zoo:
         return self.entries[name]
 
     def content(self, name: str) -> bytes:
-        """Return an entry's file, once its SHA-256 is checked.
+        """Return the content of an entry's file, after checking its SHA-256.
 
         Raises:
             UnknownNameError: if there is none of this name.
-            ZooError: if it is missing, or not what the index says.
+            ZooError: if the file is missing, or its SHA-256 is not that of the index.
         """
         entry, file = self.entry(name), name + ENDING
         content = self._read(file, MOST_BYTES)

@@ -1,4 +1,4 @@
-"""Policies of a zoo, read and put there."""
+"""Read the policies of a zoo, and add those of finished runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def open_entry(zoo: Zoo, name: str) -> TrainedPolicy:
     Raises:
         UnknownNameError: if there is none of this name.
         ZooError: if the zoo is damaged.
-        CheckpointError: if the file is.
+        CheckpointError: if the policy's file is damaged.
     """
     video = Path(f"{name}.mp4")
     policy = tensors.parse(zoo.content(name), f"{PREFIX}{name}", video)
@@ -53,26 +53,26 @@ def add_run(
     progress: StepProgress,
     stop: Callable[[], bool] = lambda: False,
 ) -> Entry | None:
-    """Put the policy of a finished run into a zoo: its last, in half precision if that will do.
+    """Add the last policy of a finished run to a zoo, in half precision if that is accurate enough.
 
-    Half precision will do if sampled success and error of the rounded policy are within the 95%
-    intervals of the run's own evaluation (Student's t, over its episodes), or within what a single
-    control step changes. What is stored with the policy is its own evaluation, as rounded.
+    It is accurate enough if sampled success and error of the rounded policy are within the 95%
+    intervals of the run's own evaluation (Student's t, over its episodes), or change by no more
+    than a single control step could cause. The stored evaluation is that of the stored weights.
 
     Args:
         run: folder of the run.
-        name: of the entry; one that exists is replaced.
+        name: name of the entry; an existing entry is replaced.
         zoo: folder of the zoo, created if missing.
-        notify: called with the changes by rounding.
+        notify: called with the changes due to rounding.
         progress: called with the progress of the evaluation.
-        stop: polled meanwhile; True ends it without an entry.
+        stop: polled during the evaluation; True ends it, and no entry is made.
 
     Returns:
         The entry, or None if it was stopped.
 
     Raises:
         RunError: if the run is not finished.
-        PgdmError: if it cannot be read or evaluated.
+        PgdmError: if the run cannot be read or evaluated.
     """
     if run.status() != "finished":
         raise RunError(f"'{run.path}' is not finished but {run.status()}")
@@ -84,7 +84,7 @@ def add_run(
         return None
     recorded = run.result["metrics"]
     changes = _changes(recorded, metrics, builder, policy.cfg.eval.episodes)
-    notify(f"{name}: by rounding to float16, {'; '.join(text for text, _ in changes)}")
+    notify(f"{name}: rounded to float16, {'; '.join(text for text, _ in changes)}")
     if not all(within for _, within in changes):
         rounded, precision = policy, "float32"
         if (metrics := measure(policy, builder, progress, stop)) is None:
@@ -130,7 +130,7 @@ def _entry(
 def _changes(
     before: Mapping[str, float], after: Mapping[str, float], builder: EnvBuilder, episodes: int
 ) -> list[tuple[str, bool]]:
-    """Return what rounding changed, as text, and whether each change is within its interval."""
+    """Return each change due to rounding as text, and whether it is small enough."""
     steps = len(builder.mdp.reference) - 1
     one_step = {"success": 1 / steps, "com_error_released": 1e-3 / math.sqrt(steps)}
     found = []

@@ -1,4 +1,4 @@
-"""A hand of the user's own, made from MJCF or URDF."""
+"""Hands of the user's, made from MJCF or URDF."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which links of a hand are its palm, its fingers and its thumb, and where its points are."""
+"""Find the palm, fingers and thumb among a hand's links, and place its tracked points."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pgdm.library.couplings import Couplings
 HUMAN = ("index", "middle", "ring", "little", "thumb")
 """Human fingers, in the order of a hand's settings."""
 PREFIXES = {"index": "ff", "middle": "mf", "ring": "rf", "little": "lf", "thumb": "th"}
-"""Prefixes of the points, as in the benchmark's hands."""
+"""Prefixes of the tracked points' names, as in the benchmark's hands."""
 
 _WORDS = {
     "index": ("index", "fore", "ff", "if"),
@@ -23,11 +23,11 @@ _WORDS = {
     "little": ("little", "pinky", "lf", "pf"),
     "thumb": ("thumb", "th"),
 }
-"""Words in the names of links and joints; those of two letters count at the beginning only."""
-_MOST_WRIST = 3  # joints that move the palm; more are an arm
-_SAME_M = 0.005  # joints nearer to each other than this are one knuckle
+"""Words in the names of links and joints; words of two letters count only at a name's start."""
+_MOST_WRIST = 3  # most joints that may move the palm; with more, the hand is on an arm
+_SAME_M = 0.005  # joints closer together than this form one knuckle
 _PAD_M = 0.012  # from the end of a finger to the middle of its pad
-_ALONG = 0.8  # cosine from which on a joint's axis runs along the link and not across
+_ALONG = 0.8  # from this cosine on, a joint's axis counts as running along the link
 _PALM_M = 0.09  # length of a palm without any geometry
 
 
@@ -36,16 +36,16 @@ class Finger:
     """One finger."""
 
     human: str
-    """Human finger that it follows, of :data:`HUMAN`."""
+    """Human finger that it corresponds to, of :data:`HUMAN`."""
     joints: list[int]
-    """Its joints from the palm outwards."""
+    """Ids of its joints, from the palm outwards."""
     link: int
-    """Body of its last link."""
+    """Body id of its last link."""
 
 
 @dataclass(frozen=True)
 class Anatomy:
-    """The parts of a hand, of a model whose first joints are not yet those of a base."""
+    """The parts of a hand; ids are those of the model without base joints."""
 
     palm: int
     """Body that carries the fingers; 0 if they are fixed to the world."""
@@ -54,19 +54,19 @@ class Anatomy:
     fingers: list[Finger]
     """In the order of :data:`HUMAN`."""
     points: dict[str, tuple[str, np.ndarray]] = field(repr=False)
-    """Name of the body, and place (3,) m in its frame of each point, the wrist's first."""
+    """Tracked points by name, the wrist first: name of a body and position (3,) m in its frame."""
     wrist: np.ndarray
-    """Where the wrist is (3,) m, in the model's world frame."""
+    """Position of the wrist (3,) m, in the model's world frame."""
     along: np.ndarray
-    """Direction (3,) of the straight fingers."""
+    """Direction (3,) of the straight fingers, in the model's world frame."""
     across: np.ndarray
-    """Direction (3,) from the index finger's side to the little finger's."""
+    """Direction (3,) from the index finger's side to the little finger's, in the same frame."""
     found_by: str
     """``names``, ``geometry`` or ``--fingers``."""
 
 
 def straight(model: mujoco.MjModel) -> mujoco.MjData:
-    """Return the kinematics of a hand with its joints at zero, or as near to it as they go."""
+    """Return the kinematics of a hand with each joint at zero or its limit nearest to zero."""
     data = mujoco.MjData(model)
     data.qpos[:] = np.zeros(model.nq).clip(*model.jnt_range.T)
     Couplings(model, model.njnt).apply(data.qpos)
@@ -82,12 +82,12 @@ def find(model: mujoco.MjModel, chosen: Mapping[str, str], label: str) -> Anatom
 
     Args:
         model: the hand alone.
-        chosen: link or joint of each human finger, if the user names them.
+        chosen: a link or joint of each human finger, if the user names them; else empty.
         label: the hand's file, for messages.
 
     Raises:
-        ConfigError: it has fewer than three or more than five fingers, is on an arm, or a finger
-            cannot be told from the others.
+        ConfigError: the hand has fewer than three or more than five fingers or is on an arm, two
+            fingers share a joint, or ``chosen`` does not fit.
     """
     moved = model.body_jntnum > 0
     parents = model.body_parentid
@@ -105,7 +105,7 @@ def find(model: mujoco.MjModel, chosen: Mapping[str, str], label: str) -> Anatom
     if len(wrist_joints) > _MOST_WRIST:
         raise ConfigError(
             f"{label}: {len(wrist_joints)} joints move the palm '{_name(model, palm)}': it is on "
-            "an arm. Cut the file to the hand: pgdm gives it six base joints in place of the arm"
+            "an arm. Reduce the file to the hand; pgdm adds six base joints in place of the arm"
         )
     chains = [_joints(model, path[: path.index(palm)]) for path in paths]
     for one, tip in zip(chains, tips, strict=True):
@@ -143,7 +143,7 @@ def _humans(
     chosen: Mapping[str, str],
     label: str,
 ) -> tuple[list[str], str]:
-    """Return the human finger of each chain, and how it was found."""
+    """Return the human finger of each chain of joints, and how they were found."""
     names = [_names(model, chain, tip) for chain, tip in zip(chains, tips, strict=True)]
     if chosen:
         return _chosen(names, tips, model, chosen, label), "--fingers"
@@ -177,21 +177,21 @@ def _chosen(
         with_it = [i for i, known in enumerate(names) if name in known]
         if len(with_it) != 1 or with_it[0] in found:
             raise ConfigError(
-                f"{label}: --fingers {human}={name} names no finger of its own; the last links "
+                f"{label}: --fingers {human}={name} does not identify one finger; the last links "
                 f"are {_listed(_name(model, tip) for tip in tips)}"
             )
         found[with_it[0]] = human
     if len(found) < len(tips) or "thumb" not in found.values():
         missing = [_name(model, tip) for i, tip in enumerate(tips) if i not in found]
         raise ConfigError(
-            f"{label}: --fingers must name every finger, and a thumb; it lacks "
+            f"{label}: --fingers must name every finger, including a thumb; it lacks "
             f"{_listed(missing) or 'the thumb'}"
         )
     return [found[i] for i in range(len(tips))]
 
 
 def _by_words(names: set[str]) -> str | None:
-    """Return the human finger that most names of a finger speak of, or None."""
+    """Return the human finger that most names of a finger point to; None if none or several do."""
     counts = {
         human: sum(any(_says(name.lower(), word) for word in words) for name in names)
         for human, words in _WORDS.items()
@@ -213,7 +213,7 @@ def _names(model: mujoco.MjModel, chain: list[int], tip: int) -> set[str]:
 def _points(
     data: mujoco.MjData, model: mujoco.MjModel, finger: Finger, end: np.ndarray
 ) -> dict[str, tuple[int, np.ndarray]]:
-    """Return body and place, world frame, of a finger's knuckle, middle and distal point."""
+    """Return body and position (3,) m, world frame, of a finger's knuckle, middle, distal point."""
     anchors = np.array([_middle(model, data, finger.joints, k) for k in range(len(finger.joints))])
     knuckle = anchors[0]
     half = 0.5 * float(np.linalg.norm(end - knuckle))
@@ -233,7 +233,7 @@ def _end(model: mujoco.MjModel, data: mujoco.MjData, tip: int, label: str) -> np
     if not len(corners):
         raise ConfigError(
             f"{label}: fingertip '{_name(model, tip)}' has no collision geometry, so it could not "
-            "touch anything; give its link some"
+            "touch anything; add some to its link"
         )
     last = int(model.body_jntadr[tip] + model.body_jntnum[tip] - 1)
     start = _middle(model, data, [last], 0)
@@ -245,7 +245,7 @@ def _end(model: mujoco.MjModel, data: mujoco.MjData, tip: int, label: str) -> np
 def _middle(
     model: mujoco.MjModel, data: mujoco.MjData, joints: list[int], number: int
 ) -> np.ndarray:
-    """Return the point (3,) m of a finger's joint that is beside the middle of the link it moves.
+    """Return a finger joint's anchor (3,) m, shifted along its axis to the middle of its link.
 
     A file may put the anchor anywhere along a hinge's axis, such as at the side of the link.
     """
@@ -270,7 +270,7 @@ def _wrist(
     knuckles: np.ndarray,
     along: np.ndarray,
 ) -> np.ndarray:
-    """Return the wrist (3,) m: the last wrist joint, else the palm's end behind the knuckles."""
+    """Return the wrist (3,) m: the last wrist joint, else the palm's end opposite the fingers."""
     if wrist_joints:
         return data.xanchor[wrist_joints[-1]].copy()
     corners = _corners(model, data, _welded(model, palm))
@@ -293,12 +293,12 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> n
 
 
 def _welded(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return the bodies that move as one with a body."""
+    """Return a body and those rigidly attached to it."""
     return np.flatnonzero(model.body_weldid == model.body_weldid[body]).tolist()
 
 
 def _ancestors(parents: np.ndarray, body: int) -> list[int]:
-    """Return a body and those that carry it, the world last."""
+    """Return a body and its ancestors, the world last."""
     path = [int(body)]
     while path[-1]:
         path.append(int(parents[path[-1]]))
@@ -306,7 +306,7 @@ def _ancestors(parents: np.ndarray, body: int) -> list[int]:
 
 
 def _joints(model: mujoco.MjModel, bodies: list[int]) -> list[int]:
-    """Return the joints of bodies listed from a fingertip inwards, the outermost last."""
+    """Return the joints of bodies, outermost last; the bodies are in the opposite order."""
     starts = [(int(model.body_jntadr[b]), int(model.body_jntnum[b])) for b in reversed(bodies)]
     return [j for start, count in starts for j in range(start, start + count)]
 

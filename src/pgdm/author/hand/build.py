@@ -1,4 +1,4 @@
-"""A hand's model as pgdm needs it: on six base joints, with one position servo for each joint."""
+"""Build a hand's model as pgdm needs it: on six base joints, with a position servo per joint."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOUNT = "mount"
 """Body that the base joints move; its origin is the wrist."""
 
 WRIST_M = (0.0, -0.27, 0.2)
-"""Where the wrist is while the base is at zero, world frame: where Adroit's is."""
+"""Position of the wrist with the base joints at zero, world frame: Adroit's."""
 
 # Axes of the mount in the world: the slides go left, up and forward, as those of the benchmark's
 # hands; the fingers point forward (y) and the palm faces down.
@@ -34,9 +34,9 @@ _BASE = (
 """Name, axis and range [m, rad] of the base joints."""
 _BASE_KP, _BASE_DAMPING, _ARMATURE = (175.0, 150.0), 20.0, 0.001  # Adroit's: slides, hinges
 
-_STIFF_S2 = 2e-4  # least inertia of a joint as a share of that gain: stable at steps of 4 ms
+_STIFF_S2 = 2e-4  # least armature per servo gain that is stable with substeps of 4 ms
 _SURFACE = {"friction": [1.0, 0.5, 0.01], "condim": 4, "margin": 0.0005}  # the benchmark's
-# Every attribute, since the file's defaults apply to what is added too.
+# Every attribute is set, since the file's defaults would apply to added elements, too.
 _JOINT = {
     **{"damping": f"{_BASE_DAMPING:g}", "armature": f"{_ARMATURE:g}", "limited": "true"},
     **{"frictionloss": "0.001", "stiffness": "0", "margin": "0", "pos": "0 0 0", "ref": "0"},
@@ -51,13 +51,13 @@ _POINT_M = 0.01
 
 @dataclass(frozen=True)
 class Plan:
-    """What to build."""
+    """How to build a hand's model."""
 
     name: str
     rotation: np.ndarray
-    """Orientation (3, 3) of the hand's own frame in the world, base at zero."""
+    """Orientation (3, 3) of the file's frame in the world, base joints at zero."""
     place: np.ndarray
-    """Where the wrist is (3,) m, world frame, base at zero."""
+    """Position of the wrist (3,) m, world frame, base joints at zero."""
     servos: dict[str, Servo]
     """By joint; coupled joints have none."""
     ranges: dict[str, tuple[float, float]]
@@ -65,7 +65,7 @@ class Plan:
     plain_surface: bool
     """Whether the geoms get the benchmark's friction: URDF states none."""
     reset: dict[str, float]
-    """Joints whose reset position is not zero."""
+    """Reset positions, rad or m, of the joints where it is not zero."""
     excluded: list[tuple[str, str]]
     """Pairs of bodies that do not collide: they overlap in the reset pose."""
 
@@ -75,7 +75,7 @@ class Plan:
 
 
 def named(xml: str) -> mujoco.MjSpec:
-    """Return the spec of a hand, with a name for each joint and body."""
+    """Return the spec of a hand, with names for the joints and bodies that had none."""
     spec = mujoco.MjSpec.from_string(xml)
     for kind, elements in (("joint", spec.joints), ("link", spec.bodies)):
         for number, element in enumerate(elements):
@@ -85,10 +85,10 @@ def named(xml: str) -> mujoco.MjSpec:
 
 
 def light(xml: str) -> str:
-    """Return a hand without what touches nothing, which takes long to compile."""
+    """Return a hand without geoms that do not collide, whose meshes take long to compile."""
     spec = named(xml)
     model = spec.compile()
-    for body in spec.bodies[1:]:  # all but the world; its mass may be that of what it shows
+    for body in spec.bodies[1:]:  # not the world; mass may come from geoms that are deleted below
         whole = model.body(body.name)
         if whole.mass[0] > 0:
             body.explicitinertial, body.fullinertia = True, [math.nan] * 6
@@ -107,8 +107,8 @@ def build(xml: str, anatomy: Anatomy, plan: Plan) -> ET.Element:
 
     Args:
         xml: the hand as read.
-        anatomy: its parts.
-        plan: its servos and poses.
+        anatomy: parts of the hand.
+        plan: servos, ranges and poses.
     """
     hand = named(xml)
     for name, (body, place) in anatomy.points.items():
@@ -185,7 +185,7 @@ def _set_surface(hand: mujoco.MjSpec, plan: Plan) -> None:
 
 
 def _pulled(hand: mujoco.MjSpec) -> list[mujoco.MjsTendon]:
-    """Return the tendons that actuators pull."""
+    """Return the tendons that actuators drive."""
     kinds = mujoco.mjtTrn.mjTRN_TENDON
     names = {a.target for a in hand.actuators if a.trntype == kinds}
     return [tendon for tendon in hand.tendons if tendon.name in names]
@@ -200,7 +200,7 @@ def _point(body: mujoco.MjsBody, name: str, place: np.ndarray) -> None:
 def reset_of(model: mujoco.MjModel, chosen: Mapping[str, float], label: str) -> dict[str, float]:
     """Return the reset position of each joint that is not at zero.
 
-    The rule: zero, or the end of its range that is nearest to it; what the user chose comes first.
+    A joint takes the position the user chose, else zero, or the limit nearest to zero.
 
     Args:
         model: the hand as read, with its narrowed ranges.

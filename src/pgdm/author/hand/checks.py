@@ -1,4 +1,4 @@
-"""Checks of a hand that was made: self-collision, masses, limits, and servos that hold it."""
+"""Checks of a user's hand: self-collision, masses, limits, and how well its servos hold it."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ class Checks:
     """Results of the checks of a hand."""
 
     joints: int
-    """Joints after the base."""
+    """Number of joints, without the base."""
     coupled: int
-    """Of these, joints that follow another."""
+    """Number of these that follow another joint."""
     mass_kg: float
     excluded: list[tuple[str, str]]
     """Pairs of links that overlap in the reset pose; they do not collide."""
     self_collisions: list[tuple[str, str]]
     """Further pairs that overlap in the mean hand."""
     height_m: float
-    """Lowest point of the hand in the reset pose above the table."""
+    """Height of the hand's lowest point above the table in the reset pose."""
     reset_error_rad: float
-    """Largest error of a joint after two seconds in the reset pose."""
+    """Largest joint error, rad or m, after the servos held the reset pose for two seconds."""
     mean_error_rad: float
     """The same for the mean hand."""
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return names and texts, for a table."""
+        """Return name and text of each row of a table."""
         driven = self.joints - self.coupled
         return [
             ("joints", f"{self.joints}: {driven} with a servo each, {self.coupled} that follow"),
-            ("limits", "every joint has them; the reset pose is inside"),
+            ("limits", "every joint has limits; the reset pose is within them"),
             ("mass", f"{self.mass_kg:.3f} kg, inertias positive"),
             ("self-collision", self._overlaps()),
             ("servos", self._held()),
             ("height", f"lowest point {100 * self.height_m:.1f} cm above the table at reset"),
-            ("contract", "what a scene demands of a hand is fulfilled"),
+            ("contract", "the hand meets the requirements of a scene"),
         ]
 
     def _overlaps(self) -> str:
@@ -62,7 +62,7 @@ class Checks:
             text = f"switched off where links overlap in the reset pose: {pairs}{more}"
         if self.self_collisions:
             pairs = ", ".join(f"{one} and {two}" for one, two in self.self_collisions[:4])
-            text += f"; in the mean hand these touch: {pairs}"
+            text += f"; in the mean hand these overlap: {pairs}"
         return text
 
     def _held(self) -> str:
@@ -73,7 +73,7 @@ class Checks:
 
 
 def overlapping(scene: Scene) -> list[tuple[str, str]]:
-    """Return the pairs of a hand's links that overlap in its reset pose, without the prefix."""
+    """Return the pairs of links that overlap in the reset pose, named without the hand's prefix."""
     return _overlaps(scene, scene.index.reset)
 
 
@@ -83,7 +83,7 @@ def check(scene: Scene, excluded: list[tuple[str, str]], mean: np.ndarray) -> Ch
     Args:
         scene: as from :func:`pgdm.sim.scene.bare_scene`.
         excluded: pairs of links that were excluded from collision.
-        mean: its mean hand (n,).
+        mean: the mean hand (n,), m and rad, base at zero.
 
     Raises:
         SceneError: a link has no mass or inertia, the hand is implausibly heavy or light, is inside
@@ -124,7 +124,7 @@ def check(scene: Scene, excluded: list[tuple[str, str]], mean: np.ndarray) -> Ch
 
 
 def _at(scene: Scene, joints: np.ndarray) -> np.ndarray:
-    """Return qpos (nq,) with the hand's joints, and the ball out of the way."""
+    """Return qpos (nq,) with the given hand joints, and the bare scene's ball out of the way."""
     qpos = np.zeros(scene.model.nq)
     qpos[: len(joints)] = joints
     qpos[len(joints)] = _AWAY_M
@@ -165,7 +165,9 @@ def _lowest(scene: Scene, qpos: np.ndarray) -> float:
 
 
 def _held(scene: Scene, joints: np.ndarray) -> float:
-    """Return the largest error of a finger joint after the servos held a pose for two seconds.
+    """Return the largest error of the joints after the servos held a pose for two seconds.
+
+    The unit is rad, or m for a slide; the base does not count.
 
     Raises:
         SceneError: the simulation diverges.

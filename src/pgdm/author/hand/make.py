@@ -1,4 +1,4 @@
-"""A hand of the user's own: read, understood, mounted, checked, and stored with its settings."""
+"""Make a user's hand: read and analyse the file, mount and check the hand, and store it."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from pgdm.sim.scene import HandCfg, Scene, bare_scene
 R = TypeVar("R")
 
 MEAN_SHARE = 0.37
-"""How far the mean hand closes the joints that close, as a share of the way from straight: the mean
-over the three hands of the benchmark, 0.38, 0.35 and 0.39."""
+"""Where the mean hand has its closing joints, as a share of the way from straight to closed: the
+mean over the three hands of the benchmark, 0.38, 0.35 and 0.39."""
 
 _KP = (0.01, 1000.0)
 _PLACE_M = ((-1.0, 1.0), (-1.5, 0.5), (0.0, 1.5))
@@ -51,21 +51,22 @@ class HandRequest:
     name: str
     """Name of the hand in the library."""
     root: Path | None = None
-    """Folder that the file's meshes must not leave; None: the file's own."""
+    """Folder that must contain all meshes; None: the file's folder."""
     fingers: Mapping[str, str] = field(default_factory=dict)
-    """A link or joint of each human finger; empty: found by names or geometry."""
+    """A link or joint of each human finger; empty: find the fingers by names or geometry."""
     reset: Mapping[str, float] = field(default_factory=dict)
-    """Reset position of joints, rad or m; others: zero, or the nearest end of their range."""
+    """Reset position of joints, rad or m; other joints: zero, or the limit nearest to zero."""
     kp: float | None = None
     """Gain of all finger servos, N m/rad; None: the file's, or 3."""
     place: tuple[float, float, float] = models.WRIST_M
-    """Where the wrist is while the base is at zero, m, world frame."""
+    """Position of the wrist with the base joints at zero, m, world frame."""
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Turns of the hand about the world's x, y and z axes, away from fingers forward, palm down."""
+    """Rotation about the world's x, then y, then z axis; at zero the fingers point along y and the
+    palm faces down."""
     drop_tendons: bool = False
-    """Leave out tendons that actuators pull."""
+    """Leave out tendons that actuators drive."""
     licence: str = "unstated"
-    """Licence of the model, its SPDX name if it has one."""
+    """Licence of the model, preferably as its SPDX identifier."""
     replace: bool = False
     """Replace a hand of the same name."""
 
@@ -93,16 +94,16 @@ class AuthoredHand:
 
 
 def author_hand(request: HandRequest, progress: StepProgress = silent) -> AuthoredHand:
-    """Create a hand of the user's from a MJCF or URDF file.
+    """Create a hand from an MJCF or URDF file.
 
     Args:
-        request: the hand.
+        request: the hand to create.
         progress: receives the steps.
 
     Raises:
         ConfigError: a value is wrong, a name is taken, or fingers cannot be distinguished.
-        CorruptAssetError: the file cannot be used; gives the reason.
-        SceneError: the model that was made is not what pgdm needs.
+        CorruptAssetError: the file cannot be used; the message says why.
+        SceneError: the resulting model does not compile or fails a check.
         LibraryError: the user's folder cannot be written.
     """
     _check(request)
@@ -119,7 +120,7 @@ def author_hand(request: HandRequest, progress: StepProgress = silent) -> Author
         model.jnt_range[model.joint(name).id] = span
     found = parts.find(model, request.fingers, label)
     reset = models.reset_of(model, request.reset, label)
-    progress("finding its palm", 1, 4)
+    progress("finding the palm", 1, 4)
     plan = models.Plan(
         *(request.name, np.eye(3), np.zeros(3), servos, ranges),
         *(source.kind == "URDF", reset, []),
@@ -131,16 +132,16 @@ def author_hand(request: HandRequest, progress: StepProgress = silent) -> Author
     plan = replace(plan, excluded=overlapping(_scene(light, found, plan, cfg)))
     if said := _other_side(label, source.xml, side):
         notes.append(said)
-    progress("checking it", 2, 4)
+    progress("checking the hand", 2, 4)
     root = _quietly(models.build, source.xml, found, plan)
     scene = _compiled(root, cfg)
     mean = _mean(scene)
     cfg = replace(cfg, mean_fingers_rad=[float(q) for q in mean[6 + cfg.num_wrist_joints :]])
     scene = replace(scene, hand=cfg)
     checks = check(scene, plan.excluded, mean)
-    progress("writing it", 3, 4)
+    progress("writing the hand", 3, 4)
     folder = _store(request, root, cfg, source, notes, side, found)
-    progress("writing it", 4, 4)
+    progress("writing the hand", 4, 4)
     return AuthoredHand(
         *(request.name, folder, settings_path(request.name), source, found, cfg, scene, side),
         *(servos, mean, checks, notes),
@@ -205,15 +206,15 @@ def _compiled(root: ET.Element, cfg: HandCfg) -> Scene:
 
 
 def _quietly(function: Callable[..., R], *arguments: Any) -> R:
-    """Call a function without the warnings of MuJoCo's mesh readers; errors are errors."""
+    """Call a function and suppress warnings, such as those of MuJoCo's mesh readers."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return function(*arguments)
 
 
 def _palm_normal(xml: str, found: Anatomy, plan: models.Plan, cfg: HandCfg) -> np.ndarray:
-    """Return the direction (3,) the palm faces, in the hand's own frame: where fingers bend."""
-    scene = _scene(xml, found, plan, cfg)  # with the hand's own frame as the world's
+    """Return the direction (3,) the palm faces, in which fingers bend, in the file's frame."""
+    scene = _scene(xml, found, plan, cfg)  # with the file's axes as the world's
     flexion = Flexion(scene)
     qpos = np.zeros(scene.model.nq)
     qpos[: scene.index.num_joints] = straight(scene)
@@ -223,10 +224,11 @@ def _palm_normal(xml: str, found: Anatomy, plan: models.Plan, cfg: HandCfg) -> n
 def _mounted(
     found: Anatomy, normal: np.ndarray, turn_deg: tuple[float, float, float]
 ) -> tuple[np.ndarray, str]:
-    """Return the orientation (3, 3) with fingers forward and the palm down, and the hand's side.
+    """Return the hand's orientation (3, 3) and its side.
 
-    With fingers along f and a palm that faces n, the little finger of a right hand is on the side
-    of n x f; that of a left hand is opposite.
+    Without ``turn_deg``, fingers point forward and the palm faces down. If the fingers point along
+    f and the palm faces n, a right hand has its little finger in the direction n x f, a left hand
+    in the opposite one.
     """
     along = found.along
     facing = normal - along * (along @ normal)
@@ -244,12 +246,14 @@ def _mounted(
 
 
 def _other_side(label: str, xml: str, side: str) -> str | None:
-    """Return a sentence if the file's names speak of the other side."""
+    """Return a note if the name of the file or model contains the other side."""
     model = ET.fromstring(xml).get("model", "")
     other = "left" if side == "right" else "right"
     words = f"{label} {model}".lower()
     if other in words and side not in words:
-        return f"the names say {other} hand, the thumb is where that of a {side} hand is"
+        return (
+            f"the file's names say {other} hand, but its fingers are arranged as in a {side} hand"
+        )
     return None
 
 
@@ -271,7 +275,7 @@ def _store(
     side: str,
     found: Anatomy,
 ) -> Path:
-    """Store the model in the library source ``own``, and its settings in the user's folder."""
+    """Store the model in the library source ``own``, and the settings in the user's folder."""
     facts: dict[str, Any] = {
         "file": request.file.name,
         "sha256": manifest.sha256_of(request.file),

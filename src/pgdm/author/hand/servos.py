@@ -1,4 +1,4 @@
-"""The position servos of a hand's joints, and the ranges that coupled joints leave them."""
+"""Position servos of a hand's joints, and joint ranges that keep coupled joints in theirs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pgdm.errors import ConfigError
 from pgdm.library.couplings import Couplings
 
 KP = 3.0
-"""Gain of a servo that the file does not state, N m/rad."""
+"""Gain of a servo if the file does not state it, N m/rad."""
 _DAMPING_S = 0.05  # damping of a joint that has none, as a share of its servo's gain
 _SINGLE = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 _OUT_RAD = 1e-3  # by how much a coupled joint may leave its range
@@ -23,9 +23,9 @@ class Servo:
     """Position servo of one joint."""
 
     kp: float
-    """N m/rad, N/m for a slide."""
+    """Gain, N m/rad; N/m for a slide."""
     damping: float
-    """Damping of the joint, N m s/rad."""
+    """Damping of the joint, N m s/rad; N s/m for a slide."""
     low: float
     high: float
     """Range of its targets, rad or m."""
@@ -44,12 +44,12 @@ def servos(
     Args:
         model: the hand as read.
         kp: gain of all servos, N m/rad; None: the file's, or :data:`KP`.
-        drop_tendons: whether an actuator on a tendon is left out instead of refused.
+        drop_tendons: whether to leave out actuators on tendons instead of raising an error.
         label: the hand's file, for messages.
 
     Raises:
-        ConfigError: an actuator drives a tendon, a joint has no range, or a constraint other than
-            a joint that follows another holds part of the hand.
+        ConfigError: an actuator drives a tendon; a joint is neither hinge nor slide, or has no
+            range or a ``ref``; or there is an equality constraint that does not couple two joints.
     """
     couplings = Couplings(model, model.njnt)
     _check_equalities(model, couplings, label)
@@ -71,7 +71,9 @@ def servos(
     for joint in range(model.njnt):
         name = model.joint(joint).name
         if mujoco.mjtJoint(model.jnt_type[joint]) not in _SINGLE:
-            raise ConfigError(f"{label}: joint '{name}' is no hinge or slide; replace it by hinges")
+            raise ConfigError(
+                f"{label}: joint '{name}' is not a hinge or slide; replace it with hinges"
+            )
         if (
             not model.jnt_limited[joint]
             or not model.jnt_range[joint, 0] < model.jnt_range[joint, 1]
@@ -79,12 +81,14 @@ def servos(
             raise ConfigError(f"{label}: joint '{name}' has no limits; give it a range")
         if model.qpos0[joint]:
             raise ConfigError(
-                f"{label}: joint '{name}' has ref {model.qpos0[joint]:g}; pgdm needs 0: take ref "
-                "off its range, and turn its body"
+                f"{label}: joint '{name}' has ref {model.qpos0[joint]:g}; pgdm needs 0: subtract "
+                "ref from its range, and rotate its body instead"
             )
         if joint in couplings.followers:
             if joint in driven:
-                notes.append(f"the actuator of '{name}' was left out: it follows another joint")
+                notes.append(
+                    f"the actuator of '{name}' was left out: this joint follows another joint"
+                )
             continue
         found[name] = _servo(model, joint, driven.get(joint, []), kp, notes)
     return found, notes
@@ -105,7 +109,9 @@ def _servo(
                 low, high = within if within[0] < within[1] else (low, high)
         else:
             name = model.joint(joint).name
-            notes.append(f"the actuator of '{name}' is no position servo and was replaced by one")
+            notes.append(
+                f"the actuator of '{name}' is not a position servo; a position servo replaces it"
+            )
     given = gain is not None and kp is None
     gain = gain if given and gain is not None else (KP if kp is None else kp)
     return Servo(
@@ -118,15 +124,15 @@ def _check_equalities(model: mujoco.MjModel, couplings: Couplings, label: str) -
         if number not in couplings.rows:
             kind = mujoco.mjtEq(model.eq_type[number]).name[5:].lower()
             raise ConfigError(
-                f"{label}: has an equality constraint of kind '{kind}'; only a joint that follows "
-                "another joint is supported: a closed loop has no joint positions of its own"
+                f"{label}: has an equality constraint of kind '{kind}'; only those by which a "
+                "joint follows another are supported, not closed kinematic loops"
             )
     for follower, leader in zip(couplings.followers, couplings.leaders, strict=True):
         if leader in couplings.followers:
             raise ConfigError(
                 f"{label}: joint '{model.joint(int(follower)).name}' follows "
-                f"'{model.joint(int(leader)).name}', which follows another; write both as "
-                "functions of that one"
+                f"'{model.joint(int(leader)).name}', which follows another; make both follow the "
+                "latter"
             )
 
 

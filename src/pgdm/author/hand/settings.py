@@ -1,4 +1,4 @@
-"""The settings of a hand of the user's own, as a file of the config group ``hand``."""
+"""Settings file of a user's hand, in the config group ``hand``."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pgdm.sim.scene import HandCfg
 
 
 def settings_path(name: str) -> Path:
-    """Return the file with the settings of a hand of the user's."""
+    """Return the settings file of a user's hand."""
     return paths.inside(paths.user_conf() / "hand", name, kind="hand", suffix=".yaml")
 
 
 def settings_text(cfg: HandCfg, origin: str, side: str) -> str:
-    """Return the file's text, with a comment on each key as in ``conf/hand``."""
+    """Return the text of the settings file, with a comment on each key as in ``conf/hand``."""
     points = "".join(f"\n  - {point}" for point in cfg.points)
     mean = ", ".join(f"{angle:.4f}" for angle in cfg.mean_fingers_rad)
     return f"""# A {side} hand made by 'pgdm author hand' from {origin}.

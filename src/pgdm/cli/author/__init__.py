@@ -1,1 +1,1 @@
-"""``pgdm author``."""
+"""The commands ``pgdm author ...``."""

@@ -1,4 +1,4 @@
-"""``pgdm author``: its commands and their options; a module named like each does the work."""
+"""``pgdm author``: commands and their options; each runs in the module of the same name."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def make_object(
         typer.Option(metavar="NAME", help="Name of the object: lower-case letters, digits, '_'."),
     ],
     scale: Annotated[
-        float | None, typer.Option(help="Metres in one unit of the file [1].", metavar="S")
+        float | None, typer.Option(help="Metres per unit of the file [1].", metavar="S")
     ] = None,
     unit: Annotated[
         str | None, typer.Option(help="Unit of the file: mm, cm or m.", metavar="UNIT")
     ] = None,
     mass: Annotated[
         float | None,
-        typer.Option(help="Mass, kg; by default from volume and density.", metavar="KG"),
+        typer.Option(help="Mass, kg [from volume and density].", metavar="KG"),
     ] = None,
     density: Annotated[
         float | None,
@@ -48,7 +48,7 @@ def make_object(
         ),
     ] = None,
     parts: Annotated[
-        int | None, typer.Option(help="Convex parts at most, 1 to 64.", metavar="N")
+        int | None, typer.Option(help="Largest number of convex parts, 1 to 64.", metavar="N")
     ] = None,
     threshold: Annotated[
         float, typer.Option(help="Concavity that may remain, 0.01 to 1; lower gives more parts.")
@@ -62,8 +62,8 @@ def make_object(
 ) -> None:
     """Make an object from a mesh.
 
-    The mesh is repaired, checked, split into convex parts, weighed, dropped and drawn into
-    picture.png in the object's folder.
+    The mesh is repaired, checked and split into convex parts. The object is weighed, dropped on a
+    table in simulation, and drawn to picture.png in its folder.
     """
     own.check_object_name(name, replace)
     with loading():
@@ -88,25 +88,25 @@ def make_hand(
     fingers: Annotated[
         list[str] | None,
         typer.Option(
-            help="A link of each finger, if they are not found: thumb=LINK,index=LINK,...",
+            help="A link of each finger, if pgdm cannot find them: thumb=LINK,index=LINK,...",
             metavar="LIST",
         ),
     ] = None,
     reset: Annotated[
         list[str] | None,
         typer.Option(
-            help="Joints of the reset pose, rad: JOINT=ANGLE,... [zero, or the nearest limit].",
+            help="Joints in the reset pose, rad or m: JOINT=POSITION,... [zero, or nearest limit].",
             metavar="LIST",
         ),
     ] = None,
     mount: Annotated[
         str,
-        typer.Option(help="Where the wrist is at the start, m: forward is y.", metavar="X,Y,Z"),
+        typer.Option(help="Wrist position in the reset pose, m, world frame.", metavar="X,Y,Z"),
     ] = "0,-0.27,0.2",
     turn: Annotated[
         str,
         typer.Option(
-            help="Turn it about the axes x, y, z, degrees, from fingers forward and palm down.",
+            help="Rotate the hand about the world's x, y, z, degrees [fingers along y, palm down].",
             metavar="X,Y,Z",
         ),
     ] = "0,0,0",
@@ -115,12 +115,12 @@ def make_hand(
         typer.Option(help="Gain of the finger servos, N m/rad [the file's, or 3].", metavar="KP"),
     ] = None,
     drop_tendons: Annotated[
-        bool, typer.Option("--drop-tendons", help="Leave out tendons that actuators pull.")
+        bool, typer.Option("--drop-tendons", help="Leave out tendons that actuators drive.")
     ] = False,
     root: Annotated[
         Path | None,
         typer.Option(
-            help="Folder that the meshes must not leave [the file's own].",
+            help="Folder that must contain all meshes [the file's folder].",
             metavar="DIR",
             callback=existing,
         ),
@@ -134,8 +134,8 @@ def make_hand(
 ) -> None:
     """Make a hand from MJCF or URDF.
 
-    It gets six base joints, a position servo for each joint, points to observe, a reset pose and
-    a mean hand; it is checked and drawn into picture.png in the hand's folder.
+    The hand gets six base joints, a position servo for each joint, points to observe, a reset pose
+    and a mean hand; it is checked and drawn to picture.png in its folder.
     """
     shipped = [path.stem for path in (conf_dir() / "hand").glob("*.yaml")]
     own.check_hand_name(name, shipped, replace)
@@ -184,15 +184,15 @@ def make_task(
     origin: Annotated[
         str,
         typer.Option(
-            help="Point whose positions were recorded: com, or mesh (the origin of its file)."
+            help="Point whose positions were recorded: com, or mesh (the mesh file's origin)."
         ),
     ] = "com",
     pregrasp: Annotated[
         str,
         typer.Option(
             help="mean or open: search for a pose near the object with fingers close to the mean "
-            "or the open hand; later: no pre-grasp yet; a pre-grasp's .npz; or a task whose finger "
-            "pose to keep close to.",
+            "or the open hand; TASK: with fingers close to that task's pre-grasp; FILE.npz: this "
+            "pre-grasp; later: none yet.",
             metavar="WHICH",
         ),
     ] = "mean",
@@ -211,11 +211,11 @@ def make_task(
 ) -> None:
     """Make a task from an object, a hand and a motion.
 
-    pgdm-run task=ID then trains it.
+    Train it with pgdm-run task=ID.
     """
     own.check_task_name(task, suites(), replace)
     library = open_library()
-    # An empty one is filled first, since hands and table come with it.
+    # If the library is empty, ``run`` fills it first, since it provides the hands and the table.
     if library.is_filled:
         check_name("object", object_name, library.objects())
     with loading():

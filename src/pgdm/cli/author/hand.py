@@ -1,4 +1,4 @@
-"""``pgdm author hand``: a hand from MJCF or URDF, printed and drawn."""
+"""``pgdm author hand``: make a hand from MJCF or URDF, print its properties and draw it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from pgdm.sim.hand_sheet import write_hand_sheet
 
 
 def pairs(option: str, words: Sequence[str]) -> dict[str, str]:
-    """Return ``a=b,c=d``, perhaps in several words, as a dictionary.
+    """Parse ``a=b,c=d``, possibly split over several words, into a dictionary.
 
     Raises:
-        ConfigError: one is not of that form, or a name is there twice.
+        ConfigError: an entry does not have that form, or a name occurs twice.
     """
     found: dict[str, str] = {}
     for word in ",".join(words).split(","):
@@ -30,10 +30,10 @@ def pairs(option: str, words: Sequence[str]) -> dict[str, str]:
 
 
 def numbers(option: str, text: str) -> tuple[float, float, float]:
-    """Return three numbers of a text such as ``0,-0.3,0.2``.
+    """Parse a text such as ``0,-0.3,0.2``.
 
     Raises:
-        ConfigError: it has not three.
+        ConfigError: it does not consist of three numbers.
     """
     try:
         x, y, z = (float(word) for word in text.split(","))
@@ -43,17 +43,17 @@ def numbers(option: str, text: str) -> tuple[float, float, float]:
 
 
 def angles(words: Sequence[str]) -> dict[str, float]:
-    """Return ``--reset`` as positions by joint, rad or m.
+    """Parse ``--reset`` into positions by joint, rad or m.
 
     Raises:
-        ConfigError: a value is no number.
+        ConfigError: a value is not a number.
     """
     found = {}
     for name, text in pairs("--reset", words).items():
         try:
             found[name] = float(text)
         except ValueError as error:
-            raise ConfigError(f"--reset {name}={text}: '{text}' is no number") from error
+            raise ConfigError(f"--reset {name}={text}: '{text}' is not a number") from error
     return found
 
 
@@ -94,7 +94,7 @@ def _found(made: AuthoredHand) -> list[tuple[str, str]]:
         ("side", made.side),
         ("fingers", f"{fingers}; found by {found.found_by}"),
         ("wrist", f"{len(found.wrist_joints)} joints move the palm"),
-        ("servos", f"gain {', '.join(f'{g:g}' for g in gains)}; {given} as in the file"),
+        ("servos", f"gain {', '.join(f'{g:g}' for g in gains)}; {given} with the file's gain"),
         ("reset", f"all joints at zero{f', but {moved}' if moved else ''}"),
     ]
     if made.source.mimics:

@@ -31,4 +31,4 @@ def run() -> None:
     for table in (objects, hands, tasks):
         if table.row_count:
             tables().print(table)
-    print(f"in {own.folder()}")
+    print(f"stored in {own.folder()}")

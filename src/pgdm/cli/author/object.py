@@ -1,4 +1,4 @@
-"""``pgdm author object``: an object from a mesh, printed and drawn."""
+"""``pgdm author object``: make an object from a mesh, print its properties and draw it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pgdm.sim.object_sheet import write_object_sheet
 
 
 def metres(scale: float | None, unit: str | None) -> float:
-    """Return the metres in one unit of a mesh's file.
+    """Return the metres per unit of a mesh's file.
 
     Raises:
-        ConfigError: both are given, or there is no such unit.
+        ConfigError: both are given, or the unit is unknown.
     """
     if scale is not None and unit is not None:
         raise ConfigError("--scale and --unit exclude each other; give one of them")

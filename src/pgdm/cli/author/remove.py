@@ -1,4 +1,4 @@
-"""``pgdm author remove``: one of the user's objects, hands or tasks."""
+"""``pgdm author remove``: remove one of the user's objects, hands or tasks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def run(name: str, sure: bool) -> None:
         sure: whether to skip the question.
 
     Raises:
-        UnknownNameError: the user has none of that name.
+        UnknownNameError: the user has nothing of that name.
         LibraryError: it is an object or a hand that tasks still use.
     """
     kind = own.kind_of(own.read(), name)
@@ -30,7 +30,7 @@ def run(name: str, sure: bool) -> None:
 
         remove_hand(name)
     else:
-        from pgdm.author.task import remove_task  # which loads torch
+        from pgdm.author.task import remove_task  # imported here because it loads torch
 
         if (aside := remove_task(name)) is not None:
             print(f"its pre-grasps are kept in {aside}")

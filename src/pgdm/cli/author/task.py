@@ -1,4 +1,4 @@
-"""``pgdm author task``: a task from an object, a hand and a motion, printed and drawn."""
+"""``pgdm author task``: make a task from an object, a hand and a motion, print and draw it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(request: TaskRequest, offline: bool) -> None:
         PgdmError: a name or the motion is wrong, or the task cannot be stored.
     """
     with bars() as progress:
-        for step in _STEPS:  # so that all that is still to come is seen
+        for step in _STEPS:  # so that the display lists all steps from the start
             progress(step, 0, 1)
         made = author_task(request, _with_hands(offline, progress), progress)
         progress(_PICTURE, 0, 1)
@@ -50,14 +50,14 @@ def run(request: TaskRequest, offline: bool) -> None:
         print(f"reach:   {outcome(made.plan)}")
     else:
         print(
-            f"reach:   the pre-grasp is not reached ({'; '.join(made.plan.failures)}): episodes "
-            "start at the pose itself"
+            f"reach:   the pre-grasp is not reached ({'; '.join(made.plan.failures)}); episodes "
+            "start at the pre-grasp itself"
         )
     print(f"next:    pgdm-run +experiment=fast task={made.id}")
 
 
 def _with_hands(offline: bool, progress: StepProgress) -> Library:
-    """Open the library; an empty one is filled first, since hands and table come with it."""
+    """Open the library, which provides hands and table; if it is empty, fill it first."""
     library = open_library()
     if library.is_filled:
         return library
@@ -76,7 +76,7 @@ def _draw(made: AuthoredTask, path: Path) -> str:
 
 
 def film_panels(made: AuthoredTask) -> list[Panel]:
-    """Return frames of the motion; the hand moves rigidly with the object, as zero residuals do."""
+    """Return pictures of the motion, the hand moving rigidly with the object (zero residuals)."""
     poses, scene = made.motion.poses, made.scene
     reference = ObjectReference(torch.from_numpy(poses.pos), torch.from_numpy(poses.quat))
     qpos = motion_qpos(scene, made.pregrasp.qpos, reference)

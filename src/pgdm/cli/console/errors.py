@@ -1,4 +1,4 @@
-"""Errors as the user sees them: one line with the wrong value and a remedy, and an exit code."""
+"""Report errors to the user: one line with the wrong value and a remedy, and an exit code."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ INTERRUPTED = 130
 """Exit code: stopped by a signal (128 + SIGINT); SIGTERM gives 143."""
 
 EXPECTED = (PgdmError, OSError, MemoryError, KeyboardInterrupt)
-"""Errors that may occur in a correct program."""
+"""Errors that are not bugs in pgdm."""
 
 _CURES = {
     errno.ENOSPC: "the disk is full; make room and run the same command again",
@@ -96,7 +96,7 @@ def guarded(command: Callable[[], int], debug: bool) -> int:
     """Run a command and return its exit code; errors become one line on stderr."""
     _open_streams()
     if any(option.startswith("error") for option in sys.warnoptions):
-        # Libraries warn of what only they can change.
+        # pgdm's users cannot fix what libraries warn about: do not turn it into errors.
         warnings.simplefilter("default")
     with _one_line(debug), deferred(), _printable():
         try:
@@ -106,7 +106,7 @@ def guarded(command: Callable[[], int], debug: bool) -> int:
 
 
 def _open_streams() -> None:
-    """Replace standard streams that were closed (``>&-``), or files would take their numbers."""
+    """Replace closed standard streams (``>&-``), so that no file gets their descriptors."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 (it stays open)
@@ -114,7 +114,7 @@ def _open_streams() -> None:
 
 @contextmanager
 def _printable() -> Iterator[None]:
-    """Write out the control characters in what is printed inside."""
+    """Escape control characters in all that is printed within the with block."""
     out, err = (stream and Printable(stream) for stream in (sys.stdout, sys.stderr))
     with redirect_stdout(out), redirect_stderr(err):
         yield
@@ -133,9 +133,9 @@ def _flushed(code: int) -> int:
 
 @contextmanager
 def _one_line(debug: bool) -> Iterator[None]:
-    """Show unexpected errors as one line too.
+    """Print unexpected errors as one line, too.
 
-    It sets the interpreter's hook and catches nothing: an error still ends the process.
+    This replaces ``sys.excepthook`` and catches nothing: an error still ends the process.
     """
 
     def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
@@ -144,5 +144,5 @@ def _one_line(debug: bool) -> Iterator[None]:
 
     before, sys.excepthook = sys.excepthook, hook
     yield
-    # Reached only without an error: on one, the hook must outlive this function.
+    # Not reached after an error: the hook must then stay, since the interpreter calls it later.
     sys.excepthook = before

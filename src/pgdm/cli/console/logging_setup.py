@@ -21,6 +21,6 @@ def set_up_logging(debug: bool) -> None:
         format="%(levelname)s: %(message)s", level=logging.WARNING, handlers=[handler]
     )
     logging.getLogger("pgdm").setLevel(logging.DEBUG if debug else logging.WARNING)
-    # Warnings of libraries are for developers.
+    # Warnings of libraries are shown only with --debug.
     logging.captureWarnings(True)
     logging.getLogger("py.warnings").setLevel(logging.WARNING if debug else logging.ERROR)

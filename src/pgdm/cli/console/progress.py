@@ -22,8 +22,8 @@ class ProgressView(callback.Callback):
     """Shows frames, speed, success, return and the remaining time.
 
     Args:
-        title: what is trained.
-        console: where to print; on a terminal one line is updated.
+        title: label of the live line, such as the task.
+        console: where to print; on a terminal a single line is updated.
     """
 
     def __init__(self, title: str, console: Console) -> None:

@@ -31,7 +31,7 @@ from pgdm.library.progress import ProgressLines, StepProgress
 
 
 class _Clean(Console):
-    """A console of rich whose texts hold no control characters; rich's own are kept."""
+    """A rich console that escapes control characters in texts, and keeps those of rich itself."""
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
@@ -78,7 +78,7 @@ def loading() -> Iterator[None]:
 
 @contextmanager
 def _every(interval_s: float, call: Callable[[], object]) -> Iterator[None]:
-    """Call something again and again while inside, from another thread."""
+    """Call a function every ``interval_s`` from another thread, during the with block."""
     ended = threading.Event()
 
     def repeat() -> None:
@@ -125,7 +125,7 @@ def bars(patience_s: float = 0.0) -> Iterator[StepProgress]:
 
 @contextmanager
 def each(names: Sequence[str]) -> Iterator[Iterator[tuple[str, StepProgress]]]:
-    """Give names one by one, each with a progress to report to, and show how many are done."""
+    """Iterate over names, each with a callback for its progress, and show how many are done."""
     with bars() as progress:
         yield _announced(names, progress)
 
@@ -169,7 +169,7 @@ class _Rows:
         if kind not in self._rows:
             self._rows[kind] = self._bars.add_task(step, total=None)
         row = self._rows[kind]
-        if done < self._done.get(kind, 0):  # the step begins anew
+        if done < self._done.get(kind, 0):  # the step starts again
             self._bars.reset(row)
         self._done[kind] = done
         # A row without a total pulses.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pgdm.experiment import RunResult
 
 PAPER_START = "planned"
-_NOT_PAPER = ("seed", "pregrasp", "eval.episodes")  # shown separately, or of no importance
+_NOT_PAPER = ("seed", "pregrasp", "eval.episodes")  # shown elsewhere, or irrelevant here
 _SHOWN_CHANGES = 4
 
 
@@ -108,7 +108,7 @@ def _title(cfg: ExperimentCfg) -> str:
 
 
 def _caption(cfg: ExperimentCfg, frames: int, start: str) -> str:
-    """Return how far the run is comparable with the paper's values."""
+    """Return the caption: whether the run is comparable with the paper's values, and why not."""
     if cfg.task.paper_success is None:
         return f"budget '{cfg.budget}'; the paper reports no value for this task"
     differs = [f"{frames:,} of {PAPER_FRAMES:,} frames"] if frames < PAPER_FRAMES else []
@@ -119,7 +119,7 @@ def _caption(cfg: ExperimentCfg, frames: int, start: str) -> str:
     if len(changed) > _SHOWN_CHANGES:
         differs.append(f"{len(changed) - _SHOWN_CHANGES} more settings")
     if not differs:
-        return "the paper's settings; its values are means of 3 seeds, this is one"
+        return "the paper's settings; the paper's values are means of 3 seeds, this run is one seed"
     return f"budget '{cfg.budget}', not comparable with the paper's values: {', '.join(differs)}"
 
 

@@ -1,4 +1,4 @@
-"""A sweep as the user watches it: a live table on a terminal, plain lines elsewhere."""
+"""Progress of a sweep: a live table on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _WIDE = 120
 
 
 class SweepView:
-    """Shows the running jobs and the progress of the sweep; a context.
+    """Context manager that shows the running jobs and the progress of a sweep.
 
     Args:
         name: name of the sweep.
-        ledger: its record.
-        queue: its jobs in Slurm.
+        ledger: ledger of the sweep.
+        queue: the sweep's jobs in Slurm.
     """
 
     def __init__(self, name: str, ledger: Ledger, queue: Queue) -> None:
@@ -52,7 +52,7 @@ class SweepView:
         self._live.stop()
 
     def update(self) -> None:
-        """Show the current state, unless that was done a moment ago."""
+        """Show the current state, unless it was last shown less than two seconds ago."""
         now = time.monotonic()
         if now - self._shown_s < _REFRESH_S:
             return
@@ -116,7 +116,7 @@ def failures(found: Sequence[Row]) -> str:
     for row in failed:
         parts.append(f"failed: {row.name} (attempt {row.attempts}), log: {row.log}")
         if row.log is not None and row.log.exists():
-            with suppress(OSError):  # it is no file
+            with suppress(OSError):  # the log cannot be read
                 text = files.read_bytes(row.log).decode(errors="replace")
                 parts += [f"  | {line}" for line in text.splitlines()[-_TAIL_LINES:]]
     return "\n".join(parts)
@@ -158,6 +158,6 @@ def live_table(name: str, found: Sequence[Row], summary: Summary) -> Group:
                 percent(row.success),
                 _UNKNOWN if row.left_s is None else span(row.left_s),
             )
-    whole = Table.grid()  # a bar alone does not end its line
+    whole = Table.grid()  # ends the line, which a bar alone does not
     whole.add_row(ProgressBar(summary.total_frames, summary.frames, width=40))
     return Group(table, whole, Text(summary_line(name, summary)))

@@ -1,4 +1,4 @@
-"""``pgdm deploy check``: the form of a playback, and the limits of the arm."""
+"""``pgdm deploy check``: check the format of a playback, and that it respects the arm's limits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def run_check(file: Path) -> int:
     """Print what a playback holds and which limits it exceeds; return the exit code.
 
     Raises:
-        PlaybackError: if the file is no playback.
+        PlaybackError: if the file is not a playback.
     """
     playback = read(file)
     used = limits.usage(playback.time_s, playback.arm_joints_rad)
@@ -38,7 +38,9 @@ def describe(file: Path, playback: Playback, used: limits.Usage) -> None:
     for violation in used.violations:
         say(f"violation: {violation.described}")
     if used.violations and used.slower < 1:
-        say(f"within velocity, acceleration and jerk at {used.slower:.2f} of this speed")
+        say(
+            f"at {used.slower:.2f} of this speed, velocity, acceleration and jerk are within limits"
+        )
 
 
 def _joint(share: np.ndarray) -> str:

@@ -1,4 +1,4 @@
-"""``pgdm deploy``: its commands and their options; a module named like each does the work."""
+"""``pgdm deploy``: commands and their options; each runs in the module of the same name."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def export_playback(
         int, typer.Option(min=1, help="Episodes to choose from; the best is exported.")
     ] = 16,
     sampled: Annotated[
-        bool, typer.Option("--sampled", help="Draw actions instead of taking the mean action.")
+        bool, typer.Option("--sampled", help="Sample actions instead of using the mean action.")
     ] = False,
     best: Annotated[
         bool, typer.Option("--best", help="Use the run's best checkpoint instead of its last.")
@@ -58,21 +58,21 @@ def export_playback(
     base: Annotated[
         str,
         typer.Option(
-            help="Base of the hand: where it was (reached), or its targets (commanded).",
+            help="Motion of the hand's base: as simulated (reached), or its targets (commanded).",
             metavar="KIND",
         ),
     ] = "reached",
     speed: Annotated[float, typer.Option(help="Fraction of the simulation's speed.")] = 1.0,
     smooth: Annotated[
-        float, typer.Option(help="Smoothing of the commands, standard deviation, s.")
+        float, typer.Option(help="Standard deviation of the commands' Gaussian smoothing, s.")
     ] = 0.04,
-    hold: Annotated[float, typer.Option(min=0, help="Hold the end for so long, s.")] = 1.0,
-    rate: Annotated[float, typer.Option(min=10, max=1000, help="Samples a second.")] = 100.0,
+    hold: Annotated[float, typer.Option(min=0, help="How long to hold the last command, s.")] = 1.0,
+    rate: Annotated[float, typer.Option(min=10, max=1000, help="Samples per second.")] = 100.0,
     arm: Annotated[
         str | None,
         typer.Option(
             metavar="'X Y TURN'",
-            help="Arm's base in the world: x and y, m, and turn, degrees [by hand].",
+            help="Arm's base in the world: x, y, m, and turn (yaw), degrees [the hand's default].",
             callback=_numbers(3, "x y turn"),
         ),
     ] = None,
@@ -83,15 +83,16 @@ def export_playback(
         str | None,
         typer.Option(
             metavar="'X Y Z R P Y'",
-            help="Hand's mount body at the flange: m, then roll, pitch, yaw, degrees [by hand].",
+            help="Hand's mount body in the flange's frame: m, then roll, pitch, yaw, degrees "
+            "[the hand's default].",
             callback=_numbers(6, "x y z roll pitch yaw"),
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Write the file although the arm cannot play it.")
+        bool, typer.Option("--force", help="Write the file even if the arm cannot play it.")
     ] = False,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the episodes; by default that of the run.")
+        int | None, typer.Option(min=0, help="Seed of the episodes; by default the run's.")
     ] = None,
     offline: Offline = False,
 ) -> None:
@@ -115,7 +116,7 @@ def export_playback(
 
 @app.command("check")
 def check_playback(file: _File) -> None:
-    """Check a playback file: its form, and the limits of the arm."""
+    """Check that a playback file is well-formed and respects the arm's limits."""
     with loading():
         from pgdm.cli.deploy.check import run_check
 
@@ -126,15 +127,18 @@ def check_playback(file: _File) -> None:
 def simulate_playback(
     file: _File,
     boxes: Annotated[
-        int, typer.Option(min=1, help="Objects to try; each is drawn anew in a randomised task.")
+        int,
+        typer.Option(
+            min=1, help="Random objects to try; without effect unless the task is randomised."
+        ),
     ] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the objects.")] = 0,
     video: Video = None,
     offline: Offline = False,
 ) -> None:
-    """Play a file open-loop on arm and hand in simulation, and say what was lifted.
+    """Play a file open-loop on arm and hand in simulation, and print how many objects are held.
 
-    Arm and hand follow the commands with joint controllers; nothing is corrected on the way.
+    Arm and hand follow the commands with joint controllers; the policy corrects nothing.
     """
     with loading():
         from pgdm.cli.deploy.simulate import SimulateRequest, run_simulate
@@ -152,7 +156,7 @@ def study_playbacks(
     boxes: Annotated[int, typer.Option(min=1, help="Objects to try for each run.")] = 100,
     offline: Offline = False,
 ) -> None:
-    """Export and simulate all runs of a task: the paper's real-world check.
+    """Export and simulate all runs of a task, in place of the paper's real-world experiment.
 
     Each playback is written into its run's folder, and the table also as playbacks.json in DIR.
     """
@@ -177,7 +181,7 @@ def play_playback(
 ) -> None:
     """Play a file on a Franka arm. Without --move nothing moves.
 
-    The arm first goes to the start, slowly. Ctrl-C brings it to rest. The hand is not moved.
+    The arm first moves slowly to the start. Ctrl-C brings it to rest. The hand is not moved.
     """
     if move and robot is None:
         raise ConfigError("--move needs --robot HOST")

@@ -1,4 +1,4 @@
-"""``pgdm deploy export``: from a trained policy to a playback."""
+"""``pgdm deploy export``: convert an episode of a trained policy into a playback."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class ExportRequest:
     run: Path
     out: Path
     episodes: int
-    """How many to choose from."""
+    """Number of episodes to choose from."""
     sampled: bool
-    """Whether actions are drawn; otherwise they are the policy's mean."""
+    """Whether actions are sampled; otherwise they are the policy's mean."""
     best: bool
     """Whether to take the best checkpoint instead of the last."""
     force: bool
-    """Whether to write what the arm cannot play."""
+    """Whether to write the playback even if the arm cannot play it."""
     seed: int | None
     offline: bool
 
@@ -43,16 +43,16 @@ class Place:
     """Where the arm is, see `Setup`."""
 
     arm_at: Floats | None = None
-    """None: that of the hand, as for ``mount``."""
+    """None: the default of the hand; likewise for ``mount``."""
     table_height_m: float = Setup.table_height_m
     mount: Floats | None = None
 
 
 def run_export(request: ExportRequest, cfg: ConvertCfg, place: Place) -> int:
-    """Write the playback and print what it asks of the arm; return the exit code.
+    """Write the playback and print how much of the arm's limits it uses; return the exit code.
 
     Raises:
-        PgdmError: if the run is damaged, its policy loses the object in all episodes, or something
+        PgdmError: if the run is damaged, its policy loses the object in all episodes, or a file
             cannot be fetched or written.
     """
     begun = time.monotonic()
@@ -60,14 +60,14 @@ def run_export(request: ExportRequest, cfg: ConvertCfg, place: Place) -> int:
     describe(request.out, done.playback, done.usage)
     miss, turn = done.path.position_error_m.max(), done.path.rotation_error_rad.max()
     say = partial(console().print, soft_wrap=True, markup=False, highlight=False)
-    say(f"inverse kinematics: {1e3 * miss:.3f} mm and {turn:.5f} rad off at most")
+    say(f"inverse kinematics: errors of at most {1e3 * miss:.3f} mm and {turn:.5f} rad")
     drawn = {key: round(value, 3) for key, value in done.playback.facts["variation"].items()}
     say(f"episode: {done.playback.facts['episodes']} {drawn or ''}")
     if done.unreached:
         say(f"violation: {done.unreached}")
     if not (done.possible or request.force):
-        notify("the arm cannot play this: nothing was written; --speed slows it down, --arm and "
-               "--mount place it otherwise, --force writes it nevertheless")  # fmt: skip
+        notify("the arm cannot play this: nothing was written; slow it down with --speed, move arm "
+               "or hand with --arm or --mount, or write it anyway with --force")  # fmt: skip
         return 1
     write(request.out, done.playback)
     say(f"written: {request.out} ({time.monotonic() - begun:.1f} s)")
@@ -75,7 +75,7 @@ def run_export(request: ExportRequest, cfg: ConvertCfg, place: Place) -> int:
 
 
 def converted(request: ExportRequest, cfg: ConvertCfg, place: Place) -> Converted:
-    """Roll the policy of a run out and convert its best episode.
+    """Roll out the policy of a run, and convert its best episode.
 
     Raises:
         PgdmError: as for `run_export`.
@@ -105,7 +105,7 @@ def converted(request: ExportRequest, cfg: ConvertCfg, place: Place) -> Converte
             "checkpoint": Path(trained.name).name,
             "frames": trained.frames,
             "asset_source": builder.scene.asset_source,
-            "episodes": f"best of {len(rollouts)} that lasted, of {count}",
+            "episodes": f"best of {len(rollouts)} that were not terminated early, of {count}",
             "metrics": {k: v for k, v in chosen.metrics.items() if "/" not in k and v == v},
             "variation": chosen.variation,
             "start_qpos": chosen.qpos[0].tolist(),

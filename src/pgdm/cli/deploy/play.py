@@ -1,4 +1,4 @@
-"""``pgdm deploy play``: a playback on a real arm."""
+"""``pgdm deploy play``: play a playback on a real arm."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def run_play(file: Path, robot: str | None, move: bool, realtime: bool) -> int:
     """Check a playback, connect, and move the arm if asked to; return the exit code.
 
     Raises:
-        PgdmError: if the file is no playback, exceeds the arm's limits, or the arm refuses.
+        PgdmError: if the file is not a playback or exceeds the arm's limits, or the arm rejects it.
     """
     playback = read(file)
     check_playable(playback)
@@ -28,7 +28,7 @@ def run_play(file: Path, robot: str | None, move: bool, realtime: bool) -> int:
         return 0
     player = Player(robot, realtime)
     away = np.abs(player.joints - playback.arm_joints_rad[0])
-    print(f"{robot}: {JOINTS[int(away.argmax())]} is {away.max():.2f} rad from the start, the most")
+    print(f"{robot}: farthest from the start is {JOINTS[int(away.argmax())]}, {away.max():.2f} rad")
     if not move:
         print("dry run: nothing was moved (--move moves the arm)")
         return 0

@@ -1,4 +1,4 @@
-"""``pgdm deploy simulate``: a playback on arm and hand in simulation, its verdict and its film."""
+"""``pgdm deploy simulate``: play a playback on a simulated arm and hand; print and film it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pgdm.sim.draw import Shots, draw
 from pgdm.sim.render import write_video
 from pgdm.sim.scene import OBJECT_MASSES, Scene
 
-_FPS = 10  # of the film, in real time
+_FPS = 10  # of the video, which plays in real time
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class SimulateRequest:
 
 
 def run_simulate(request: SimulateRequest) -> int:
-    """Play a playback open-loop, print the verdict and film the first object.
+    """Play a playback open-loop, print the outcome and film the first object.
 
     Raises:
-        PgdmError: if the file is no playback or does not fit its task, assets cannot be fetched, or
-            nothing can be drawn.
+        PgdmError: if the file is not a playback or does not fit its task, assets cannot be fetched,
+            or nothing can be drawn.
     """
     with bars() as progress:
         playback, scene, outcome = simulated(request, progress)
@@ -52,7 +52,7 @@ def run_simulate(request: SimulateRequest) -> int:
 
 
 def simulated(request: SimulateRequest, progress: StepProgress) -> tuple[Playback, Scene, Outcome]:
-    """Play a playback open-loop; return it, the scene and what became of the objects.
+    """Play a playback open-loop; return the playback, the scene and the outcome.
 
     Raises:
         PgdmError: as for `run_simulate`.
@@ -76,7 +76,7 @@ def simulated(request: SimulateRequest, progress: StepProgress) -> tuple[Playbac
 def _facts(playback: Playback) -> tuple[str, str, str, Setup]:
     task, hand, stored = (playback.facts.get(key) for key in ("task", "hand", "setup"))
     if not isinstance(task, str) or not isinstance(hand, str) or not isinstance(stored, dict):
-        raise PlaybackError("its facts lack task, hand or setup: it cannot be simulated")
+        raise PlaybackError("its facts lack task, hand or setup, so it cannot be simulated")
     check_task(task)
     mass = playback.facts.get("object_mass", "volume")
     if mass not in OBJECT_MASSES:
@@ -99,8 +99,8 @@ def _print(outcome: Outcome) -> None:
     if outcome.held.any():
         high = end[outcome.held]
         say(
-            f"held objects end {100 * np.mean(high):.1f} cm up ({100 * high.min():.1f} to "
-            f"{100 * high.max():.1f}), in the rollout {100 * outcome.expected_m:.1f} cm"
+            f"held objects end {100 * np.mean(high):.1f} cm above start ({100 * high.min():.1f} to "
+            f"{100 * high.max():.1f}); in the exported episode {100 * outcome.expected_m:.1f} cm"
         )
     say(f"above {100 * LIFTED_M:.0f} cm for {outcome.lifted_s.mean():.2f} s on average")
     degrees = np.degrees(outcome.arm_error_rad.max())

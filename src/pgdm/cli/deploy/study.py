@@ -1,4 +1,4 @@
-"""``pgdm deploy study``: all runs of a task, exported and simulated."""
+"""``pgdm deploy study``: export and simulate all runs of a task."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def run_study(folder: Path, task: str, speed: float, boxes: int, offline: bool) 
 
 
 def _played(run: Path, cfg: ConvertCfg, boxes: int, offline: bool) -> dict[str, float | str]:
-    """Return the row of a run."""
+    """Export and simulate a run; return its row of the table."""
     out = run / PLAYBACK
     request = ExportRequest(run, out, _EPISODES, False, False, False, None, offline)
     done = converted(request, cfg, Place())

@@ -1,1 +1,1 @@
-"""``pgdm pregrasp``."""
+"""The commands ``pgdm pregrasp ...``."""

@@ -1,4 +1,4 @@
-"""``pgdm pregrasp check``: how good pre-grasps are, stored ones or one in a file."""
+"""``pgdm pregrasp check``: measure the quality of pre-grasps, stored or in a file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,17 @@ from pgdm.pregrasp.reach.plan import ReachPlan, measure
 from pgdm.pregrasp.reach.planner import plan_reach
 from pgdm.sim.scene import Scene
 
-_HEADS = ("task", "hand", "source", "free", "deep mm", "fingertips mm", "palm deg", "lift", "reach")
+_HEADS = (
+    "task",
+    "hand",
+    "source",
+    "free",
+    "penetration mm",
+    "fingertips mm",
+    "palm deg",
+    "lift",
+    "reach",
+)
 _NUMBERS = 4, 5, 6, 7  # columns of numbers
 
 
@@ -62,7 +72,7 @@ def run(request: Request) -> None:
     """Measure pre-grasps, and print and write the measurements.
 
     Raises:
-        PgdmError: if a name is unknown, a file is damaged, or a task has no such pre-grasp.
+        PgdmError: if a name is unknown, a file is damaged, or a task lacks a requested pre-grasp.
     """
     files = {word: Path(word) for word in request.words if word.endswith(".npz")}
     if files and request.sources:
@@ -115,7 +125,7 @@ def _rows(
 
 
 def _stored(scene: Scene, motion: Motion, sources: Sequence[str]) -> list[_Checked]:
-    """Return a task's pre-grasps for this hand, the user's own before those of the library.
+    """Return a task's pre-grasps for this hand; the user's replace the library's of that source.
 
     Raises:
         ConfigError: if one of the sources is missing.
@@ -135,19 +145,19 @@ def _stored(scene: Scene, motion: Motion, sources: Sequence[str]) -> list[_Check
         own = pregrasp_file.find(task, hand, name)
         assert own is not None
         found[name] = _own(own, pregrasp_file.path_of(task, hand, name))
-    if "mined" in found and "planned" in found:  # the user's own plan takes precedence
+    if "mined" in found and "planned" in found:  # the user's own plan, if any
         found["mined"] = dataclasses.replace(found["mined"], plan=found["planned"].plan)
     missing = [source for source in sources if source not in found]
     if missing or not found:
         raise ConfigError(
             f"task '{task}' has no pre-grasp {' or '.join(missing)} for hand '{hand}'; it has: "
-            f"{', '.join(found) or 'none'}. 'pgdm pregrasp --help' lists how to make one"
+            f"{', '.join(found) or 'none'}. 'pgdm pregrasp --help' shows how to make one"
         )
     return [found[name] for name in (sources or found)]
 
 
 def _own(own: Pregrasp, path: Path | None) -> _Checked:
-    """Return the user's own pre-grasp: where its plan ends if it is one, else the pose."""
+    """Return a pre-grasp of the user's: where its plan ends if ``planned``, else its pose."""
     source = path.stem if path is not None else ""
     start = own.start if source == "planned" else own.pose
     plan = None if own.reached is None else own.reached.actions
@@ -155,10 +165,10 @@ def _own(own: Pregrasp, path: Path | None) -> _Checked:
 
 
 def _whose(file: Path, own: Pregrasp, hand: str | None) -> tuple[str, str]:
-    """Return task and hand of a file, from its note or its folders.
+    """Return task and hand of a file, from its note or else from the names of its folders.
 
     Raises:
-        ConfigError: if they name no task and hand.
+        ConfigError: if neither gives a valid task and hand.
     """
     folders = file.absolute().parent
     task = str(own.note.get("task", folders.parent.name))

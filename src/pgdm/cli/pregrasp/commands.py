@@ -1,4 +1,4 @@
-"""``pgdm pregrasp``: its commands and their options; a module named like each does the work."""
+"""``pgdm pregrasp``: commands and their options; each runs in the module of the same name."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def reach(
     hand: Hand = None,
     source: Source = "mined",
     replace: Annotated[
-        bool, typer.Option("--replace", help="Plan anew even if a plan is published or stored.")
+        bool, typer.Option("--replace", help="Plan again even if a plan is published or stored.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     offline: Offline = False,
@@ -71,7 +71,7 @@ def check(
         bool, typer.Option("--reach", help="Plan a reach to pre-grasps that have none.")
     ] = False,
     policies: Annotated[
-        int, typer.Option(min=1, help="Random closing policies of the lift test.")
+        int, typer.Option(min=1, help="Number of random closing policies in the lift test.")
     ] = 32,
     seed: Annotated[int, typer.Option(min=0, help="Seed of lift test and reach plan.")] = 0,
     json_file: Annotated[
@@ -82,7 +82,7 @@ def check(
 ) -> None:
     """Measure how good pre-grasps are.
 
-    Is the hand free of contact, near the object, facing it, able to lift it, and is it reachable?
+    Measures penetration, fingertip distance, palm angle, lift rate, and errors of the reach.
     """
     with loading():
         from pgdm.cli.pregrasp.check import Request, run
@@ -98,8 +98,8 @@ def mocap(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Human hand joints (.npz, .json, .csv); by default the library's, or those of "
-            "the task's own hand at its pre-grasp.",
+            help="Human hand joints (.npz, .json, .csv); by default the library's expert, else "
+            "points of the task's own hand at its mined pre-grasp.",
             callback=existing,
         ),
     ] = None,
@@ -133,8 +133,7 @@ def teleop(
         int | None,
         typer.Option(
             min=0,
-            help="Number of the demonstration, from 0; by default the one whose object is nearest "
-            "to the task's.",
+            help="Index of the demonstration, from 0 [that with the object nearest to the task's].",
         ),
     ] = None,
     reach: _Reach = True,
@@ -143,7 +142,7 @@ def teleop(
 ) -> None:
     """Cut a pre-grasp from a demonstration (pregrasp=teleop).
 
-    It is the pose just before the hand grasps the object.
+    The pre-grasp is the pose just before the hand grasps the object.
     """
     with loading():
         from pgdm.cli.pregrasp.teleop import run
@@ -175,7 +174,7 @@ def label(
     ] = None,
     port: Annotated[
         int,
-        typer.Option(min=0, max=65535, help="Port; if it is taken, another one is used."),
+        typer.Option(min=0, max=65535, help="Port; if it is taken, another is used."),
     ] = 8090,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page, or only serve it.")
@@ -207,7 +206,7 @@ def train(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the weights here instead of your own folder."),
+        typer.Option(metavar="FILE", help="Write the weights to this file [in your own folder]."),
     ] = None,
 ) -> None:
     """Train the predictor on the pre-grasps of the library."""
@@ -221,7 +220,7 @@ def train(
 def predict(
     task: Task,
     hand: Hand = None,
-    samples: Annotated[int, typer.Option(min=1, help="Candidates to lift-test.")] = 8,
+    samples: Annotated[int, typer.Option(min=1, help="Number of candidates to lift-test.")] = 8,
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of samples, lift test and reach plan.")
     ] = 0,
@@ -237,9 +236,9 @@ def predict(
     image: Image = None,
     offline: Offline = False,
 ) -> None:
-    """Predict a pre-grasp from shape (pregrasp=learned).
+    """Predict a pre-grasp from the object's shape (pregrasp=learned).
 
-    Candidates are sampled for the object's shape, moved free of contact and ranked by lift tests.
+    Candidates are sampled, moved out of contact and ranked by lift tests.
     """
     with loading():
         from pgdm.cli.pregrasp.predict import run

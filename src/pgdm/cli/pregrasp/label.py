@@ -48,7 +48,7 @@ def run(
 
 
 def _start(poses: Poses, draft: Draft, loaded: Loaded | None) -> Loaded:
-    """Return the pose to start from: the requested one, else the draft, else a stored one."""
+    """Return the pose to start from: as requested, else the draft, else the best available."""
     if loaded is None:
         return draft.found(poses) or poses.first()
     if draft.found(poses) is None:

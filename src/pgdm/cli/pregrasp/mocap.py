@@ -1,4 +1,4 @@
-"""``pgdm pregrasp mocap``: a human hand's pre-grasp for any robot hand."""
+"""``pgdm pregrasp mocap``: retarget a human hand to a pre-grasp of a robot hand."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def run(
 def _print_fit(made: Retargeted, scene: Scene) -> None:
     note = made.pregrasp.note
     print(f"{scene.task.id} with hand {scene.hand.name}, from {note['from']}, frame {made.frame}")
-    table = Table("fingertip", "from its target", box=None)
+    table = Table("fingertip", "distance from target", box=None)
     for i, finger in enumerate(made.fingers):
         error = f"{1e3 * made.result.fingertip_errors_m[i]:.1f} mm"
         table.add_row(finger, error if i in made.measured else "not measured")

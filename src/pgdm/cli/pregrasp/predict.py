@@ -1,4 +1,4 @@
-"""``pgdm pregrasp predict``: candidates from an object's shape, ranked, reached and stored."""
+"""``pgdm pregrasp predict``: predict a pre-grasp from an object's shape, and store it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(
 
     Raises:
         PgdmError: task, hand or weights are unknown, damaged or do not fit each other, or no
-            candidate can be made free of contact.
+            candidate can be moved out of contact.
     """
     cfg = composed(task, hand, offline=offline)
     predictor = weights.read(file or weights.path_of(cfg.hand.name), cfg.hand.name)
@@ -53,7 +53,7 @@ def run(
 def _print_candidates(found: Sequence[Candidate], chosen: int) -> None:
     """Print the candidates, best first."""
     table = Table(box=None, header_style="bold")
-    for name in ("candidate", "lift rate", "fingertips off", "palm", "freed by", ""):
+    for name in ("candidate", "lift rate", "fingertip distance", "palm", "moved by", ""):
         table.add_column(name, justify="right" if name else "left")
     for i, one in enumerate(found):
         q = one.quality
@@ -73,6 +73,6 @@ def _draw(scene: Scene, found: Sequence[Candidate], chosen: int, path: Path) -> 
     for i, one in enumerate(found):
         q = one.quality
         title = f"{scene.task.id}  {i + 1}{'  chosen' if i == chosen else ''}"
-        text = f"lift rate {q.lift_rate:.0%}, fingertips {1e3 * q.fingertip_distance_m:.0f} mm off"
+        text = f"lift rate {q.lift_rate:.0%}, fingertips {1e3 * q.fingertip_distance_m:.0f} mm away"
         panels.append(Panel(one.qpos, title, text))
     return write_sheet(scene, panels, path)

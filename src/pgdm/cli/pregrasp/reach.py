@@ -1,4 +1,4 @@
-"""``pgdm pregrasp reach``: plan reaches to pre-grasps on the simulator, and store the plans."""
+"""``pgdm pregrasp reach``: plan reaches to pre-grasps in simulation, and store the plans."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pgdm.pregrasp.reach.plan import ReachPlan
 from pgdm.pregrasp.reach.planner import REACH, plan_reach
 from pgdm.sim.scene import Scene
 
-_HEADS = ("task", "result", "base mm", "rad", "fingers rad", "object mm", "deep mm", "steps", "s")
+_HEADS = ("task", "result", "base mm", "rad", "fingers rad", "object mm", "depth mm", "steps", "s")
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class Request:
 
 
 def run(request: Request) -> int:
-    """Plan, store and print; return the exit code, which is that of a failure if any task failed.
+    """Plan and store reaches and print a table; return the exit code, 1 if any task failed.
 
     Raises:
-        PgdmError: if a name is unknown; the table reports what fails for a single task.
+        PgdmError: if a name is unknown; failures of single tasks are only printed.
     """
     tasks = expand_tasks(request.words)
     composed(tasks[0], request.hand)  # a wrong hand is reported once, not for each task
@@ -60,7 +60,7 @@ def run(request: Request) -> int:
         code = FAILED if failed else 0
     except KeyboardInterrupt:
         print(
-            "stopped; the plans in the table are stored, the same command continues",
+            "stopped; the plans in the table are stored, and the same command plans the rest",
             file=sys.stderr,
         )
         code = INTERRUPTED
@@ -72,7 +72,7 @@ def run(request: Request) -> int:
 
 
 def _plan(task: str, request: Request, progress: StepProgress) -> tuple[list[str], str]:
-    """Return a task's cells, and why it failed if it did."""
+    """Return a task's cells of the table, and why it failed; empty if it did not."""
     cfg = composed(task, request.hand, offline=request.offline)
     _, _, motion, scene = open_scene(cfg, progress)
     target = plans.pose_of(request.source, motion, scene)
@@ -87,18 +87,19 @@ def _plan(task: str, request: Request, progress: StepProgress) -> tuple[list[str
 
 
 def _kept(request: Request, scene: Scene, target: np.ndarray, published: bool) -> str:
-    """Return why the plan in store is kept; empty if one is to be planned.
+    """Return why the existing plan is kept; empty if a reach is to be planned.
 
-    A plan from this same search is always kept, so that a stopped command continues.
+    A plan that the same search made is kept even with ``--replace``, so that a stopped command can
+    be repeated.
     """
     name = "planned" if request.source == "mined" else request.source
     own = pregrasp_file.find(scene.task.id, scene.hand.name, name)
     if own is not None and own.reached is not None and np.array_equal(own.pose.qpos, target):
         if own.note.get("reach_search") == _search(request):
             return "own plan kept (this search made it)"
-        return "" if request.replace else "own plan kept (--replace plans it anew)"
+        return "" if request.replace else "own plan kept (--replace plans it again)"
     if request.source == "mined" and published and not request.replace:
-        return "published plan kept (--replace plans one of your own)"
+        return "published plan kept (--replace makes your own)"
     return ""
 
 

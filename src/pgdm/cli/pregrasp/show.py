@@ -1,4 +1,4 @@
-"""``pgdm pregrasp show``: the pre-grasps of a task."""
+"""``pgdm pregrasp show``: list the pre-grasps of a task."""
 
 from __future__ import annotations
 

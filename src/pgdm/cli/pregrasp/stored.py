@@ -1,4 +1,4 @@
-"""What the commands that make a pre-grasp share: plan its reach, report where it is stored."""
+"""Shared by the commands that make a pre-grasp: plan its reach, print where it is stored."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pgdm.sim.scene import Scene
 
 
 def planned(pregrasp: Pregrasp, opened: Opened, reach: bool, progress: StepProgress) -> Pregrasp:
-    """Return a pre-grasp with its reach plan, if one is wanted."""
+    """Return a pre-grasp, with its reach plan if ``reach`` is set."""
     if not reach:
         return pregrasp
     count = threads(opened.cfg)
@@ -39,7 +39,7 @@ def report(path: Path, scene: Scene) -> None:
 
 
 def report_with_reach(path: Path, image: Path | None, pregrasp: Pregrasp, scene: Scene) -> None:
-    """Print a pre-grasp's reach and where it is stored; draw it if a picture is wanted."""
+    """Print a pre-grasp's reach and where it is stored; draw both if ``image`` is given."""
     reach = pregrasp.note.get("reach")
     if reach:
         print(

@@ -1,4 +1,4 @@
-"""``pgdm pregrasp teleop``: a pre-grasp cut from a demonstration."""
+"""``pgdm pregrasp teleop``: cut a pre-grasp from a demonstration."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def run(
         PgdmError: the task or file is unknown or damaged, or the hand never grasps the object.
     """
     cfg = composed(task, None, offline=offline)
-    teleop.layout_of(task)  # before anything takes time
+    teleop.layout_of(task)  # an unsupported task is reported before anything takes time
     opened = open_scene(cfg)
     motion, scene = opened.motion, opened.scene
     found = demonstrations.read(file)
@@ -44,6 +44,6 @@ def run(
         f"demonstration {note['demonstration']} (of {count}): takes hold at step "
         f"{note['takes_hold_at']}, cut at step {note['step']}; its object was "
         f"{note['object_shift_mm']} mm from the task's; slides {note['beyond_range_mm']} mm beyond "
-        f"their ranges; palm within {note['palm_error_mm']} mm; penetration {note['depth_mm']} mm"
+        f"their ranges; palm error {note['palm_error_mm']} mm; penetration {note['depth_mm']} mm"
     )
     report_with_reach(path, image, pregrasp, scene)

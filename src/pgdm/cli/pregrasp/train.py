@@ -1,4 +1,4 @@
-"""``pgdm pregrasp train``: a predictor of pre-grasps, trained on all that the library has."""
+"""``pgdm pregrasp train``: train a predictor of pre-grasps on all pre-grasps of a hand."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def run(hand: str, leave_out: Sequence[str], out: Path | None) -> None:
 
 
 def _describe(predictor: Predictor, poses: int) -> list[str]:
-    """Return data and errors of a new predictor, a sentence each."""
+    """Return sentences about the data and the errors of a new predictor."""
     objects = len(predictor.objects)
     lines = [
         f"hand {predictor.hand}: {poses} pre-grasps of {objects} objects"
@@ -94,7 +94,7 @@ def _collect(hand: str, progress: StepProgress) -> list[tuple[Scene, Example]]:
             continue
         scene = build_scene(library, cfg.task, cfg.hand, cfg.sim)
         if not scene.lies_free:
-            notify(f"{task}: left out, its object, like a door, cannot move in all six directions")
+            notify(f"{task}: left out, since its object lacks some of the six degrees of freedom")
             continue
         shown = [start.qpos for start in poses if not is_reset_pose(scene, start.qpos)]
         found += [(scene, one) for qpos in shown if (one := example(scene, qpos)) is not None]
