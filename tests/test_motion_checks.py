@@ -48,9 +48,15 @@ def with_jump(at: int, by: float) -> np.ndarray:
     [
         (line(0.2)[:5], r"5 poses \(0.2 s\); valid: 10 to 500"),
         (with_jump(17, 0.15), "row 17 jumps: it is 0.15 m from row 16"),
-        (line(3.0), r"moves at 3 m/s in row .*a hand follows 2.5 at most; slow it down \(--slower"),
-        (turned_back(), r"accelerates by 60 m/s2 in row .*--smooth or --slower FACTOR help"),
-        (line(0.5, 60)[12:], r"already moves in its first step, 0.5 m/s .*--smooth adds a start"),
+        (
+            line(3.0),
+            r"moves at 3 m/s in row .*a hand can follow 2.5 at most; slow it down \(--slower",
+        ),
+        (turned_back(), r"accelerates at 60 m/s2 in row .*--smooth or --slower FACTOR help"),
+        (
+            line(0.5, 60)[12:],
+            r"already moves in its first step, 0.5 m/s .*--smooth adds a gradual start",
+        ),
     ],
 )
 def test_what_no_hand_can_do_is_named(rows: np.ndarray, said: str) -> None:
