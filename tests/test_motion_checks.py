@@ -50,7 +50,7 @@ def with_jump(at: int, by: float) -> np.ndarray:
         (with_jump(17, 0.15), "row 17 jumps: it is 0.15 m from row 16"),
         (
             line(3.0),
-            r"moves at 3 m/s in row .*a hand can follow 2.5 at most; slow it down \(--slower",
+            r"moves at 3 m/s in row .*a hand can follow 2.5 at most; slow \(--slower",
         ),
         (turned_back(), r"accelerates at 60 m/s2 in row .*--smooth or --slower FACTOR help"),
         (

@@ -291,7 +291,7 @@ class Library:
         return path
 
     def _check_unchanged(self, source: str, relative: str) -> None:
-        """Check the hash of a file, and of a model's meshes, against the manifest; once per file."""
+        """Check a file's hash, and those of a model's meshes, against the manifest; only once."""
         if (source, relative) in self._unchanged:
             return
         model = f"{relative.rpartition('/')[0]}/" if relative.endswith(".xml") else relative
