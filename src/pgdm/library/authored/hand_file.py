@@ -206,7 +206,7 @@ def _urdf(robot: ET.Element, path: Path, root: Path, notes: list[str]) -> list[P
         name, kind = joint.get("name"), joint.get("type", "")
         if kind not in _SINGLE:
             raise CorruptAssetError(
-                f"{path.name}: joint '{name}' is {kind or 'untyped'}; a hand's joints are "
+                f"{path.name}: joint '{name}' is {kind or 'of no type'}; a hand's joints are "
                 f"{', '.join(_SINGLE)}, with limits"
             )
         limit = joint.find("limit")
@@ -272,7 +272,9 @@ def _resolve_mimics(robot: ET.Element, label: str) -> None:
                     f"{label}: joint '{name}' mimics '{leader}', which is not a joint of the hand"
                 )
             if leader in seen:
-                raise CorruptAssetError(f"{label}: joint '{name}' mimics itself in a circle")
+                raise CorruptAssetError(
+                    f"{label}: joint '{name}' mimics itself through other joints"
+                )
             above = joints[leader].find("mimic")
             if above is None:
                 break
