@@ -252,7 +252,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     ),
     "mimics itself": (
         urdf(mimic=True).replace('<mimic joint="index_j1"', '<mimic joint="index_j2"'),
-        "joint 'index_j2' mimics itself through other joints",
+        "joint 'index_j2' mimics itself, forming a cycle",
     ),
     "no contact": (
         re.sub(r"<collision>.*?</collision>", "", urdf()),

@@ -272,9 +272,7 @@ def _resolve_mimics(robot: ET.Element, label: str) -> None:
                     f"{label}: joint '{name}' mimics '{leader}', which is not a joint of the hand"
                 )
             if leader in seen:
-                raise CorruptAssetError(
-                    f"{label}: joint '{name}' mimics itself through other joints"
-                )
+                raise CorruptAssetError(f"{label}: joint '{name}' mimics itself, forming a cycle")
             above = joints[leader].find("mimic")
             if above is None:
                 break

@@ -40,7 +40,7 @@ class Expert:
     qpos: np.ndarray = field(repr=False)
     """Adroit's joint positions (T, 30) as published; they may exceed the joints' limits."""
     human_joints: np.ndarray = field(repr=False)
-    """Joint locations of the human hand (T, 16, 3), MANO order; a finger's last joint is its DIP."""
+    """Joint locations of the human hand (T, 16, 3), MANO order; the last of a finger is its DIP."""
     fingertips: np.ndarray = field(repr=False)
     """Adroit's fingertips (T, 5, 3) at the joint positions clipped to their limits."""
     contacts: np.ndarray = field(repr=False)

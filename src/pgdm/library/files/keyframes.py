@@ -2,10 +2,10 @@
 
 Positions are quintic splines of time, as are the rotation vectors relative to the orientation at
 the last rest. The velocity at a keyframe is the slope of a monotone cubic interpolant, zero at
-rests; the acceleration at keyframes is zero. Thus the motion is twice continuously differentiable, starts
-and ends at rest, and passes through every keyframe. If the object
-rests at two consecutive keyframes, it moves between them along a line and by slerp, with the
-minimum-jerk profile ``10 s^3 - 15 s^4 + 6 s^5``.
+rests; the acceleration at keyframes is zero. Thus the motion is twice continuously differentiable,
+starts and ends at rest, and passes through every keyframe. If the object rests at two consecutive
+keyframes, it moves between them along a line and by slerp, with the minimum-jerk profile
+``10 s^3 - 15 s^4 + 6 s^5``.
 """
 
 from __future__ import annotations

@@ -133,7 +133,9 @@ def _repair(item: ET.Element, label: str, defects: list[str]) -> None:
         if all(token == number for token, number in zip(tokens, read, strict=True)):
             continue
         if any(number is None for number in read):
-            raise CorruptAssetError(f'{label}: {item.tag} {key}="{item.attrib[key]}" not numeric')
+            raise CorruptAssetError(
+                f'{label}: {item.tag} {key}="{item.attrib[key]}" is not numeric'
+            )
         fixed = " ".join(str(number) for number in read)
         defects.append(f'{label}: {item.tag} {key}="{item.attrib[key]}" read as "{fixed}"')
         item.set(key, fixed)
