@@ -35,7 +35,7 @@ class FreeingCfg:
     population: int = 64
     """Samples per round."""
     patience: int = _ROUNDS
-    """The search stops after this many rounds without improvement, once a pose is free."""
+    """Once a pose is free: number of rounds without improvement after which the search stops."""
     negligible_m: float = 0.0
     """Penetration up to this counts as none."""
 

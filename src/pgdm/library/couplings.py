@@ -13,7 +13,7 @@ class Couplings:
 
     Args:
         model: its first joints are slides and hinges, with all positions 0 in ``qpos0``.
-        num_joints: number of first joints among which followers are searched.
+        num_joints: number of the model's first joints; couplings with other followers are ignored.
     """
 
     def __init__(self, model: mujoco.MjModel, num_joints: int) -> None:
@@ -22,9 +22,9 @@ class Couplings:
         self.rows = np.flatnonzero(coupled)
         """Ids of the equality constraints (C,)."""
         self.followers = first[self.rows].copy()
-        """Ids of the following joints (C,)."""
+        """Joint ids of the followers (C,)."""
         self.leaders = second[self.rows].copy()
-        """Ids of the joints that they follow (C,)."""
+        """Joint ids of their leaders (C,)."""
         self._coefficients = model.eq_data[self.rows, :5].T.copy()  # (5, C)
 
     def apply(self, joints: np.ndarray) -> np.ndarray:

@@ -44,7 +44,7 @@ GRAB_COPIES = frozenset(
         *("dhand-waterbottle", "dmanus-coffeecan"),
     }
 )
-"""D'Hand and D'Manus tasks whose motion (nearly) equals that of a motion-capture task."""
+"""D'Hand and D'Manus tasks whose motion is, at least nearly, that of a motion-capture task."""
 
 REBUILT_EXPERTS = ("alarmclock-see1", "binoculars-pass1", "piggybank-use1", "waterbottle-shake1")
 """Motion-capture tasks whose published expert trajectory is an empty file; pgdm can rebuild it."""

@@ -144,8 +144,7 @@ def _check_numbers(element: ET.Element, label: str) -> None:
 
 
 def _inside(name: str, folder: Path, root: Path, label: str) -> Path:
-    """Resolve a file name; ``package://`` paths are tried below ``root``, whole or without the
-    leading folders."""
+    """Resolve a file name; in ``root``, try ``package://`` paths whole, then without first parts."""
     if name.startswith("package://"):
         rest = Path(name.removeprefix("package://"))
         places = [root / rest, *(root / Path(*rest.parts[k:]) for k in range(1, len(rest.parts)))]
@@ -258,7 +257,7 @@ def _has_range(limit: ET.Element) -> bool:
 
 
 def _resolve_mimics(robot: ET.Element, label: str) -> None:
-    """Make each mimic joint follow a joint that is no mimic itself: q = m (m' q' + o') + o."""
+    """Make each mimic joint follow a joint that mimics none: q = m (m' q' + o') + o."""
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
     for name, joint in joints.items():
         mimic = joint.find("mimic")

@@ -154,7 +154,7 @@ def _clean(mesh: trimesh.Trimesh, label: str, repairs: list[str]) -> None:
     thinnest = float(mesh.extents.min())
     if thinnest < _THIN_M:
         raise CorruptAssetError(
-            f"{label}: is flat: its shortest side is {length(thinnest)}; an object needs "
+            f"{label}: is flat, with a shortest side of {length(thinnest)}; an object needs "
             f"{length(_THIN_M)} or more"
         )
 
@@ -256,7 +256,7 @@ def _measured(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open:
     try:
         hull = float(mesh.convex_hull.volume)
     except (ValueError, RuntimeError, IndexError) as error:  # Qhull: all points in one plane
-        raise CorruptAssetError(f"{label}: is flat: it has no convex hull") from error
+        raise CorruptAssetError(f"{label}: is flat and has no convex hull") from error
     closed, volume = is_closed(mesh), abs(float(mesh.volume))
     if closed and volume < 1e-4 * hull:
         raise CorruptAssetError(

@@ -25,16 +25,16 @@ START_SPEED_M_S, START_TURN_RAD_S = 0.1, 1.0
 SUNK_M = 0.003
 """Largest accepted depth of the object's lowest point below the table top."""
 _JUMP = 4.0  # a step this many times as fast as its neighbours is a discontinuity
-_SMOOTH_STEPS, _EASE_STEPS = 2.0, 8  # sigma of the filter; poses at rest added at each end
+_SMOOTH_STEPS, _EASE_STEPS = 2.0, 8  # filter's sigma, poses added at each end
 _LIFT_STEPS = 6  # number of poses raised before and after a pose that is too low
 
 
 @dataclass(frozen=True)
 class Poses:
-    """A motion of the object's centre of mass."""
+    """A motion of an object; positions are those of its centre of mass."""
 
     pos: np.ndarray  # (T, 3) m, world frame
-    quat: np.ndarray  # (T, 4) wxyz
+    quat: np.ndarray  # (T, 4) wxyz, orientation of the object
 
 
 def speeds(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
@@ -54,7 +54,7 @@ def check_motion(poses: Poses, label: str) -> None:
     if not STEPS[0] <= steps <= STEPS[1]:
         raise ConfigError(
             f"{label}: {steps} poses ({steps * STEP_S:.1f} s); valid: {STEPS[0]} to {STEPS[1]}, "
-            f"one each {STEP_S:g} s"
+            f"one every {STEP_S:g} s"
         )
     fast, turning = speeds(poses)
     for values, limit, unit, verb in (

@@ -30,8 +30,8 @@ CLOSE_M = 0.005
 """Distance threshold of the reported share of poses at which a finger is close."""
 
 _THIN_M = 1e-6
-"""Radius of the capsule from which distances are measured: almost zero, so that the closest point is
-well defined where the finger overlaps the object."""
+"""Radius of the capsule from which distances are measured: almost zero, so that the closest point
+is well defined where the finger overlaps the object."""
 _FAR_M = 10.0  # larger distances are not measured
 _BODY = 1  # an object is one body, child of the world
 

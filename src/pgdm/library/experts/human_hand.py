@@ -18,8 +18,8 @@ RIDGE = 0.01
 """Ridge penalty per sample, for standardised features."""
 
 _STILL_M = 1e-5
-"""Coordinates with a smaller standard deviation are ignored, such as those of the knuckles, which are
-fixed in the palm."""
+"""Coordinates with a smaller standard deviation are ignored, such as those of the knuckles, which
+are fixed in the palm."""
 
 
 def matrices(quaternions: np.ndarray) -> np.ndarray:

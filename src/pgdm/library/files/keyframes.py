@@ -246,7 +246,7 @@ def _check_times(keyframes: Sequence[Keyframe], label: str) -> None:
     for i, (one, two) in enumerate(pairwise(times)):
         if not two - one >= _MIN_GAP_S - 1e-9:
             raise ConfigError(
-                f"{label}: keyframe {i + 1} at {two:g} s does not come {_MIN_GAP_S:g} s or more "
+                f"{label}: keyframe {i + 1} at {two:g} s must come {_MIN_GAP_S:g} s or more "
                 f"after keyframe {i} at {one:g} s"
             )
     if times[-1] > LONGEST_S:

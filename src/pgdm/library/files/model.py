@@ -100,7 +100,7 @@ def _inside(path: Path, root: Path, label: str) -> Path:
 
 
 def check_stays(path: Path, root: Path) -> None:
-    """Check that a file of third-party data is no link that leads out of ``root``.
+    """Check that a path in third-party data is not a link that leads out of ``root``.
 
     Raises:
         CorruptAssetError: it is; the message names the file and its target.

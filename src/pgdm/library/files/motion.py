@@ -1,4 +1,4 @@
-"""Exemplar motions in the library's format: plain arrays, checked on reading and writing."""
+"""Exemplar motions in the library's format: plain arrays, checked when read and written."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def check_unit(quaternions: np.ndarray, key: str, label: str) -> None:
     """Check that quaternions (T, 4) have norm 1.
 
     Raises:
-        CorruptAssetError: one has not; the message names the worst row.
+        CorruptAssetError: one does not; the message names the worst row.
     """
     norms = np.linalg.norm(quaternions, axis=1)
     worst = int(np.abs(norms - 1.0).argmax())

@@ -1,6 +1,7 @@
 """Values by which TCDM's D'Hand and D'Manus differ from those in the package ``robohive``.
 
-:mod:`pgdm.library.robohive.model_values` has the units and says how the values were obtained."""
+:mod:`pgdm.library.robohive.model_values` has the units and says how the values were obtained.
+"""
 
 from __future__ import annotations
 

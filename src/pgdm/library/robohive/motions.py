@@ -39,7 +39,7 @@ EXPERT_FILES = tuple(file for file, _ in _EXPERT.values())
 def locate(assets: Path, task: str) -> Path | None:
     """Return the file of a task's motion, None if missing.
 
-    The package omits the number at the end of a motion's name where the name is unique without.
+    The package omits the number at the end of a motion's name if the name is unique without it.
 
     Args:
         assets: the package's ``envs/tcdm/assets`` folder, unpacked.

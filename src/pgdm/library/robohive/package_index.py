@@ -231,7 +231,7 @@ def _tls() -> ssl.SSLContext:
 
 
 def _through_pip(package: Package, part: Path) -> None:
-    """Have pip download the file, which knows passwords and certificates for the index."""
+    """Have pip, which knows the index's passwords and certificates, download the file."""
     answer = _pip(
         "download", "--no-deps", "--ignore-requires-python", "--only-binary=:all:", "--quiet",
         "--dest", str(part.parent), f"{package.name}=={package.version}",
