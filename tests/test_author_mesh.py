@@ -114,7 +114,7 @@ def test_meshes_without_a_body_are_refused() -> None:
     nan.vertices[3] = np.nan
     for mesh, message in (
         (flat, "is flat"),
-        (point, "all its vertices are one point"),
+        (point, "all its vertices coincide"),
         (line, "all of its 1 faces have zero area"),
         (nan, r"1 of 8 vertices are NaN or infinite, the first is number 3"),
     ):

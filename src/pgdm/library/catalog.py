@@ -250,7 +250,7 @@ class Library:
 
     @property
     def is_filled(self) -> bool:
-        """Whether ``checkout`` or ``registry`` is present, which have the table and hands."""
+        """Whether ``checkout`` or ``registry`` is present, which have the table and the hands."""
         return bool(self._whole())
 
     def _whole(self) -> list[str]:

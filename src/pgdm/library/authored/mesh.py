@@ -24,7 +24,7 @@ MAX_FACES = 20_000
 """Meshes with more faces are simplified: a difference is not visible, and MuJoCo refuses more than
 200,000."""
 
-_THIN_M = 5e-4  # the contact margin; thinner objects fall through it
+_THIN_M = 5e-4  # the models' contact margin; an object must be thicker
 _OPEN_SHARE = 0.5  # an open surface with a smaller share of its hull's volume is refused
 _MAX_BODIES = 50
 _LID_SHARE = 0.15  # holes are filled if the lids have at most this share of the surface's area
@@ -54,7 +54,7 @@ class SoundMesh:
     """What was changed, one sentence each."""
 
     def trimesh(self) -> trimesh.Trimesh:
-        """Return it as trimesh's own class."""
+        """Return the mesh as a ``trimesh.Trimesh``."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
@@ -111,7 +111,7 @@ def _check_size(mesh: trimesh.Trimesh, label: str, scale: float) -> None:
     if low <= longest <= high:
         return
     if longest <= 0.0:
-        raise CorruptAssetError(f"{label}: all its vertices are one point")
+        raise CorruptAssetError(f"{label}: all its vertices coincide")
     fitting = {u: longest / scale * f for u, f in UNITS_M.items()}
     fitting = {u: size for u, size in fitting.items() if low <= size <= high}
     # Prefer the largest plausible size: objects of decimetres are more common than of centimetres.

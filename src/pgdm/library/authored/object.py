@@ -158,8 +158,8 @@ def weigh(mesh: SoundMesh, parts: list[Part], mass_kg: float | None, density: fl
     """Return mass, centre of mass and inertia at uniform density.
 
     Centre of mass and inertia are those of the enclosed volume if the surface is closed, otherwise
-    of the convex parts together (parallel-axis theorem). A missing mass is the density times the
-    mesh's volume.
+    of the convex parts together (parallel-axis theorem). If no mass is given, it is the
+    density times the mesh's volume.
 
     Args:
         mesh: the mesh.

@@ -55,7 +55,7 @@ class Part:
     """(F, 3) vertex numbers."""
 
     def trimesh(self) -> trimesh.Trimesh:
-        """Return it as trimesh's own class."""
+        """Return the part as a ``trimesh.Trimesh``."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 

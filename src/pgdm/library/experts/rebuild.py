@@ -4,7 +4,7 @@ Other recordings of the same motions exist with MyoHand (a musculoskeletal hand 
 on the motions recorded both with MyoHand and with a human hand maps MyoHand's points to the
 joint locations of the human hand, which then pull an unactuated model of the Adroit robot hand
 along. `benchmark/retarget.py` leaves out one published trajectory at a time and measures the error
-of the rebuilt one.
+of its rebuilt version.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class _Pair:
 class Rebuilder:
     """Fits a regression on all motions recorded with both hands, and rebuilds trajectories with it.
 
-    Deterministic for given packages on one type of machine.
+    The result depends only on the packages and the type of machine.
 
     Args:
         library: contains the motions and the models of table, hand and objects.

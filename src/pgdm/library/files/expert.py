@@ -16,7 +16,7 @@ from pgdm.library.files.motion import numbers
 HAND = "adroit"
 """The robot hand of the trajectories."""
 FINGERS = ("ff", "mf", "lf", "rf", "th")
-"""Order of the fingers in all arrays: fore, middle, little, ring finger, thumb."""
+"""Order of the fingers in all arrays: index, middle, little, ring finger, thumb."""
 FINGERTIPS = tuple(f"{finger}distal_point" for finger in FINGERS)
 """Fingertips of that hand, as geoms and bodies of its model."""
 
@@ -38,14 +38,14 @@ class Expert:
     task: str
     """Task id."""
     qpos: np.ndarray = field(repr=False)
-    """Adroit's joint positions (T, 30) as published; they may exceed the joints' limits."""
+    """Adroit's joint positions (T, 30), not clipped: they may exceed the joints' limits."""
     human_joints: np.ndarray = field(repr=False)
     """Joint locations of the human hand (T, 16, 3), MANO order; the last of a finger is its DIP."""
     fingertips: np.ndarray = field(repr=False)
     """Adroit's fingertips (T, 5, 3) at the joint positions clipped to their limits."""
     contacts: np.ndarray = field(repr=False)
     """Points of the object closest to the human fingers (T, 5, 3), in the frame of the object's
-    body (its origin is not the centre of mass)."""
+    body (whose origin is not the centre of mass)."""
     in_contact: np.ndarray = field(repr=False)
     """Whether each finger touches the object (T, 5), bool."""
     approximate: bool

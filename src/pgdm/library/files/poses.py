@@ -70,7 +70,7 @@ def read(path: Path) -> PoseFile:
 
 
 def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFile:
-    """Check rows and resample them to one per control step.
+    """Check rows and resample them to one row per control step.
 
     Args:
         rows: (N, 7) position m and quaternion wxyz.
