@@ -13,7 +13,7 @@ class Couplings:
 
     Args:
         model: its first joints are slides and hinges, with all positions 0 in ``qpos0``.
-        num_joints: number of the model's first joints; couplings with other followers are ignored.
+        num_joints: number n of first joints; couplings whose follower comes later are ignored.
     """
 
     def __init__(self, model: mujoco.MjModel, num_joints: int) -> None:

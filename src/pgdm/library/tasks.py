@@ -33,7 +33,7 @@ CHECKOUT_TASKS = (
     *("dmanus-coffeecan", "dmanus-crackerbox", "dmanus-sim2real", "door-open", "hammer-strike"),
     "spheremedium-relocate",
 )
-"""Tasks that only a TCDM checkout has."""
+"""Tasks that only a checkout of TCDM, the paper authors' repository, has."""
 
 BENCHMARK_TASKS = (*MOCAP_TASKS, *CHECKOUT_TASKS)
 """All tasks of the benchmark."""

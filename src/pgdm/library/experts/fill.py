@@ -1,7 +1,7 @@
 """Filling the library's folder of expert hand trajectories.
 
-They belong to no library source: the motions, hands and objects with which they are measured are
-the same in ``checkout`` and ``registry``.
+They belong to no library source: the motions, hands and objects used to measure them are the same
+in ``checkout`` and ``registry``.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import numpy as np
 from pgdm.library.files.expert import HUMAN_JOINTS
 
 LAG_FRAMES = 0.5
-"""Lag of MyoHand (a musculoskeletal hand model) behind the captured hand that pulled it, frames."""
+"""Frames by which MyoHand, a musculoskeletal hand model, lags behind the human hand pulling it."""
 
 RIDGE = 0.01
 """Ridge penalty per sample, for standardised features."""

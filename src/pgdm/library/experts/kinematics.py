@@ -40,7 +40,7 @@ class ExpertHand:
         return qpos.clip(*self._model.jnt_range.T)
 
     def beyond_limits(self, qpos: np.ndarray) -> tuple[float, float]:
-        """Return how far qpos (T, 30) exceeds limits at most: slides [m], hinges [rad]."""
+        """Return the largest excess of qpos (T, 30) over its limits: slides [m], hinges [rad]."""
         excess = np.abs(qpos - self.clipped(qpos)).max(axis=0)
         return float(excess[self._slides].max()), float(excess[~self._slides].max())
 

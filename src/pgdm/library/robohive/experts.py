@@ -18,8 +18,8 @@ FOLDER = "mj_envs/envs/tcdm/assets/tmp_data"
 """Folder of the recordings in the package."""
 
 STORED_POSES = {"alarmclock-lift": 40, "duck-lift": 38, "waterbottle-lift": 42}
-"""Number of stored poses, for motions of which TCDM uses only the first part. Their recordings end
-at the last stored pose."""
+"""Number of stored poses, for motions of which TCDM (the paper authors' repository) uses only the
+first part. Their recordings end at the last stored pose."""
 
 SHIFTED = frozenset({"alarmclock-lift"})
 """Tasks whose recorded positions have a constant offset, (0.8, -10.1, -2.9) mm from the motion's;

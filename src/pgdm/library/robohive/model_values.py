@@ -1,10 +1,11 @@
 """Values by which TCDM's models differ from those in the package ``robohive``.
 
-Both derive from the same model repositories (``vikashplus/object_sim``, ``Adroit``, ...). The
-package has the meshes, body trees and geoms; these values turn them into the benchmark's models.
-All were taken from the compiled models of a TCDM checkout with :mod:`pgdm.library.checks.compare`.
-:mod:`pgdm.library.robohive.hand_values` has the values of D'Hand and D'Manus. Lengths in m, angles
-in rad, masses in kg, gains in N/m and Nm/rad.
+TCDM is the paper authors' repository. Both sets of models derive from the same sources
+(``vikashplus/object_sim``, ``Adroit``, ...). The package has the meshes, body trees and geoms;
+these values turn them into the benchmark's models. All were taken from the compiled models of a
+TCDM checkout with :mod:`pgdm.library.checks.compare`. :mod:`pgdm.library.robohive.hand_values` has
+the values of D'Hand and D'Manus. Lengths in m, angles in rad, masses in kg, gains in N/m and
+Nm/rad.
 """
 
 from __future__ import annotations

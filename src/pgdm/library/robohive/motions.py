@@ -1,4 +1,4 @@
-"""Reading the motions of the package ``robohive``."""
+"""Reading the motions of the package ``robohive``; TCDM is the paper authors' repository."""
 
 from __future__ import annotations
 
