@@ -144,7 +144,7 @@ def _check_numbers(element: ET.Element, label: str) -> None:
 
 
 def _inside(name: str, folder: Path, root: Path, label: str) -> Path:
-    """Resolve a file name, a ``package://`` path in ``root``, whole or without its first folders."""
+    """Resolve a file name; seek ``package://`` paths in ``root``, also without first folders."""
     if name.startswith("package://"):
         rest = Path(name.removeprefix("package://"))
         places = [root / rest, *(root / Path(*rest.parts[k:]) for k in range(1, len(rest.parts)))]
