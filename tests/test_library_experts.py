@@ -320,9 +320,9 @@ def test_its_quality_is_shown(root: Path) -> None:
         "(published): robohive 0.4.0, SHA-256 00",
         "Apache-2.0  from tmp_data/Adroit_hammer_use_1.npz",
         "poses: 6, after 14 frames of the recording",
-        "off the motion's by 1.200 mm (mean), 3.400 mm (max), after a shift by (0.0, -10.1, 0.0)",
+        "the motion's by 1.200 mm (mean), 3.400 mm (max), after a shift by (0.0, -10.1, 0.0)",
         "limits by up to 0.86 rad and, at the base, 0.26 m",
-        "touches the object at 5 poses, of which",
+        "touches the object at 5 poses; by finger",
         "th in contact 1, within 5 mm 20%",
     ):
         assert words in text
