@@ -248,11 +248,11 @@ FAULTS: dict[str, tuple[str, str]] = {
     "one finger": (urdf(("index",)), "1 chains of joints end in a fingertip"),
     "mimics nobody": (
         urdf(mimic=True).replace('<mimic joint="index_j1"', '<mimic joint="nobody"'),
-        "joint 'index_j2' mimics 'nobody', which is no joint",
+        "joint 'index_j2' mimics 'nobody', which is not a joint",
     ),
     "mimics itself": (
         urdf(mimic=True).replace('<mimic joint="index_j1"', '<mimic joint="index_j2"'),
-        "joint 'index_j2' mimics itself in a circle",
+        "joint 'index_j2' mimics itself, forming a cycle",
     ),
     "no contact": (
         re.sub(r"<collision>.*?</collision>", "", urdf()),

@@ -85,7 +85,7 @@ def test_verify_names_what_is_damaged_and_fails(
     code, out, err = run(capsys, "verify")
     assert code == 1
     assert out.splitlines() == [
-        "checkout/objects/cup/meshes/contact0.stl: content changed, its SHA-256 is not the "
+        "checkout/objects/cup/meshes/contact0.stl: content changed, its SHA-256 differs from the "
         "recorded one"
     ]
     assert err.startswith("error: 1 of ")

@@ -224,7 +224,7 @@ def test_a_hostile_pickle_is_refused_and_the_library_stays(checkout: Path, libra
         (
             "objects/cup.xml",
             '<mujoco><worldbody><body pos="a b c"/></worldbody></mujoco>',
-            "has no number",
+            "not numeric",
         ),
         ("meshes/objects/cup/contact0.stl", "solid", "MuJoCo cannot compile it"),
     ],

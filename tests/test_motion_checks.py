@@ -48,9 +48,15 @@ def with_jump(at: int, by: float) -> np.ndarray:
     [
         (line(0.2)[:5], r"5 poses \(0.2 s\); valid: 10 to 500"),
         (with_jump(17, 0.15), "row 17 jumps: it is 0.15 m from row 16"),
-        (line(3.0), r"moves at 3 m/s in row .*a hand follows 2.5 at most; slow it down \(--slower"),
-        (turned_back(), r"accelerates by 60 m/s2 in row .*--smooth or --slower FACTOR help"),
-        (line(0.5, 60)[12:], r"already moves in its first step, 0.5 m/s .*--smooth adds a start"),
+        (
+            line(3.0),
+            r"moves at 3 m/s in row .*a hand can follow 2.5 at most; slow it down \(--slower",
+        ),
+        (turned_back(), r"accelerates at 60 m/s2 in row .*--smooth or --slower FACTOR help"),
+        (
+            line(0.5, 60)[12:],
+            r"already moves in its first step, 0.5 m/s .*--smooth adds a gradual start",
+        ),
     ],
 )
 def test_what_no_hand_can_do_is_named(rows: np.ndarray, said: str) -> None:
@@ -138,7 +144,7 @@ def test_slightly_wrong_quaternions_are_normalised_and_reported() -> None:
     rows[7, 3:] *= -1
     found = pose_file.resampled(rows, None, "it")
     assert found.quat == pytest.approx(np.tile(UNTURNED, (30, 1)))
-    assert "normalised quaternions, whose norms were off 1 by up to 0.001" in found.repairs
+    assert "normalised quaternions, whose norms were off by up to 0.001" in found.repairs
 
 
 def changed(row: int, column: int, value: float) -> np.ndarray:
@@ -151,11 +157,11 @@ def changed(row: int, column: int, value: float) -> np.ndarray:
     ("rows", "times", "said"),
     [
         (changed(4, 2, np.nan), None, "row 4 has a NaN or infinite value"),
-        (changed(9, 3, 0.4), None, "row 9 has a quaternion of norm 0.4, not a unit one"),
+        (changed(9, 3, 0.4), None, "row 9 has a quaternion of norm 0.4, not 1"),
         (line(0.2)[:, :6], None, r"poses have shape \(30, 6\), expected \(N, 7\)"),
         (line(0.2)[:1], None, r"poses have shape \(1, 7\)"),
         (line(0.2), np.r_[0:29, 28.0] * 0.04, r"row 29 has time 1.12 s, not after 1.12 s"),
-        (line(0.2), np.arange(29.0), "has 29 finite times for 30 rows"),
+        (line(0.2), np.arange(29.0), "has 29 times, needs 30 finite ones"),
         (line(0.2), 1e9 * np.arange(30.0), r"lasts 2.9e\+10 s; valid: 0.04 to 3600 s"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The asset library: hands, objects, scenes and motions, normalised, with their provenance."""
+"""The asset library: hands, objects, scenes and motions in one format, with their provenance."""
 
 from __future__ import annotations
 

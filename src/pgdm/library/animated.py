@@ -1,7 +1,7 @@
 """The motions that come with pgdm, compiled from keyframes into the library source ``animated``.
 
-``keyframes/<task>.yaml`` has hand and object, the keyframes (see
-:mod:`pgdm.library.files.keyframes`) and the start state: joint positions found by
+``keyframes/<task>.yaml`` names hand and object, and has the keyframes (see
+:mod:`pgdm.library.files.keyframes`) and the joint positions of the start state, found by
 tools/animated_starts.py.
 """
 
@@ -35,23 +35,23 @@ TASKS = tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))
 
 LICENCE = "MIT"
 PLACE = np.array([0.0, 0.0, 0.2])
-"""Where the tasks' settings place the object's body when its joints are zero, m."""
+"""Position of the object's body at joint positions of zero, as in the tasks' settings (m)."""
 
-_FORMAT = 1  # to be increased when the same keyframes give another motion
+_FORMAT = 1  # increase when a change of the code makes the same keyframes give another motion
 
 
 @dataclass(frozen=True)
 class AnimatedTask:
-    """A task's keyframes and start."""
+    """A task's keyframes and start state."""
 
     id: str
     hand: str
     object: str
     animation: Animation
     hand_joints: np.ndarray = field(repr=False)
-    """(n,) hand joints, m and rad: the pre-grasp."""
+    """(n,) hand joint positions, m and rad: the pre-grasp."""
     object_joints: np.ndarray = field(repr=False)
-    """(6,) object joints, m and rad: the object at rest."""
+    """(6,) object joint positions, m and rad: the object at rest on the table."""
 
 
 def read(task: str) -> AnimatedTask:
@@ -76,7 +76,7 @@ def read(task: str) -> AnimatedTask:
 
 
 def origin() -> str:
-    """Return the source's origin for its manifest; it changes with any of the keyframes."""
+    """Return the origin for the source's manifest, which includes a hash of all keyframe files."""
     digest = hashlib.sha256(str(_FORMAT).encode())
     for task in TASKS:
         digest.update((FOLDER / f"{task}.yaml").read_bytes())
@@ -90,14 +90,14 @@ def is_current(library: Library) -> bool:
 
 
 def fill(root: Path, library: Library) -> None:
-    """Compile all motions into the library; the caller must hold its lock.
+    """Compile all motions into the library; the caller must hold the library's lock.
 
     Args:
         root: the library's folder.
-        library: the library, with hands and objects.
+        library: the same library, opened; it provides the objects.
 
     Raises:
-        LibraryError: an object is missing.
+        UnknownNameError: the library lacks an object.
         CorruptAssetError: a file is damaged.
     """
     files: dict[str, FileEntry] = {}
@@ -124,7 +124,7 @@ def motion_arrays(task: AnimatedTask, library: Library) -> dict[str, np.ndarray]
 
 
 def _resting(task: AnimatedTask, object_xml: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre of mass (3,) m and orientation (4,) wxyz of the object in the start state."""
+    """Return centre of mass (3,) m and orientation (4,) wxyz of the object at the start, world."""
     import mujoco
 
     from pgdm.library.checks.compiled import compiled

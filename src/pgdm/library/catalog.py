@@ -1,4 +1,4 @@
-"""The library's content, and the source that serves each task."""
+"""The content of the library, and which library source serves each task."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from pgdm.library.files.motion import Motion
 from pgdm.library.manifest import FileEntry, Manifest, TaskEntry, sha256_of
 
 CURE = "Fill the library with 'pgdm assets fetch' or 'pgdm assets import PATH' (a TCDM checkout)."
-"""What to do if the library lacks something."""
+"""Advice in errors about a missing asset."""
 
 EXPERT_CURE = "Get the expert hand trajectories with 'pgdm assets fetch'."
-"""What to do if there are none."""
+"""Advice in errors about missing expert trajectories."""
 
 _log = logging.getLogger(__name__)
 
@@ -33,14 +33,16 @@ _PARTIAL = (staging.OWN, staging.ANIMATED)
 
 
 class Library:
-    """The assets under one root and the user's own, as they were when it was opened.
+    """The assets under one root and the user's own assets, as listed when the library was opened.
 
-    A task takes hand, objects, scene and motion from the one source that serves it, by precedence
-    ``own``, ``checkout``, ``registry``, ``animated``; ``pgdm assets use`` decides which of
-    ``checkout`` and ``registry`` comes first. Exceptions: the user's objects and hands always come
+    The source that serves a task provides its hand, objects, scene and motion; it is the first that
+    has the task, of ``own``, ``checkout``, ``registry``, ``animated``. ``pgdm assets use`` puts
+    ``registry`` before ``checkout``, or back. Exceptions: the user's objects and hands always come
     from ``own``. For a motion of ``own`` or ``animated``, all other hands and objects and the table
     come from ``checkout`` or ``registry``, by precedence. Each motion is read once: its arrays are
     shared, so copy them before changing any.
+
+    Methods that return an asset raise LibraryError if the library is empty or the file is missing.
 
     Args:
         root: the library's folder.
@@ -59,7 +61,7 @@ class Library:
         return dict(self._sources)
 
     def promising(self, task: str, entry: TaskEntry) -> Library:
-        """Return this library with one more task of the user's, whose files are not yet written."""
+        """Return this library with a task added to ``own`` whose files are not yet written."""
         empty = Manifest(source=staging.OWN, origin="", imported_at="")
         own = self._sources.get(staging.OWN, empty)
         grown = dataclasses.replace(own, tasks={**own.tasks, task: entry})
@@ -68,21 +70,21 @@ class Library:
         return Library(self.root, {**self._sources, staging.OWN: grown}, folders)
 
     def serving(self, origins: object) -> Library:
-        """Return this library with some sources before all others but ``own``.
+        """Return this library with ``checkout`` or ``registry`` moved to the front, after ``own``.
 
         Args:
-            origins: as a run recorded them, such as ``own+checkout``; sources that are missing
-                here, or None, change nothing.
+            origins: sources as a run recorded them, such as ``own+checkout``; other names, missing
+                sources and None have no effect.
         """
         present = [s for s in str(origins).split("+") if s in self._sources]
         first = [s for s in present if s in staging.SELF_CONTAINED]
-        # The user's own stay first, as everywhere.
+        # The source ``own`` always stays first.
         own = [s for s in self._sources if s == staging.OWN]
         order = dict.fromkeys((*own, *first, *self._sources))
         return Library(self.root, {s: self._sources[s] for s in order}, self._folders)
 
     def folder(self, source: str) -> Path:
-        """Return the folder of a source that is present."""
+        """Return the folder of a source in this library."""
         return self._folders[source]
 
     def tasks(self) -> dict[str, str]:
@@ -120,7 +122,8 @@ class Library:
     def origins(self, task: str, hand: str) -> str:
         """Return the sources that serve a task with a hand, such as ``own+checkout``.
 
-        The motion's source comes first; if the hand is the user's, ``own`` precedes it.
+        If the hand is the user's, ``own`` comes first; then the motion's source; then, for a motion
+        of ``own`` or ``animated``, the source of the table and other models.
 
         Raises:
             UnknownNameError: the task is not in the library.
@@ -130,7 +133,7 @@ class Library:
         return "+".join(dict.fromkeys(([staging.OWN] if self.is_own_hand(hand) else []) + used))
 
     def is_own_hand(self, hand: str) -> bool:
-        """Return whether a hand is the user's own."""
+        """Return whether a hand is one of the user's."""
         own = self._sources.get(staging.OWN)
         return own is not None and hand in own.hands
 
@@ -139,7 +142,7 @@ class Library:
 
         Raises:
             UnknownNameError: the task is not in the library (or not from that source).
-            CorruptAssetError: its file is damaged.
+            CorruptAssetError: the motion's file is damaged.
         """
         source = self._source(motion_id, source)
         if (key := (motion_id, source)) not in self._motions:
@@ -155,7 +158,7 @@ class Library:
         """Return the index of the expert hand trajectories; its file is read once.
 
         Raises:
-            CorruptAssetError: it is damaged.
+            CorruptAssetError: the index is damaged.
         """
         if self._experts is None:
             folder = staging.folder_of(self.root, staging.EXPERTS)
@@ -167,7 +170,7 @@ class Library:
         """Return provenance and quality of a task's expert hand trajectory.
 
         Raises:
-            UnknownNameError: the task has none; names the tasks that have one.
+            UnknownNameError: the task has no expert trajectory; lists the tasks that have one.
         """
         index = self.experts()
         if task not in index.experts:
@@ -181,9 +184,9 @@ class Library:
         """Read a task's expert hand trajectory.
 
         Raises:
-            UnknownNameError: the task has none; names the tasks that have one.
-            CorruptAssetError: its file is damaged.
-            LibraryError: its length differs from the motion's.
+            UnknownNameError: the task has no expert trajectory; lists the tasks that have one.
+            CorruptAssetError: the trajectory's file is damaged.
+            LibraryError: the trajectory's length differs from the motion's.
         """
         self.expert_entry(task)
         folder = staging.folder_of(self.root, staging.EXPERTS)
@@ -198,7 +201,7 @@ class Library:
         return expert
 
     def files(self) -> Iterator[tuple[str, Path, FileEntry]]:
-        """Yield name (for messages), path and entry of every recorded file, experts included."""
+        """Yield name (for messages), path and entry of every recorded file, experts' included."""
         for source, manifest in self._sources.items():
             for name, entry in manifest.files.items():
                 yield f"{source}/{name}", self._folders[source] / name, entry
@@ -209,7 +212,7 @@ class Library:
                 yield f"{staging.EXPERTS}/{name}", folder / name, expert.file
 
     def hand_xml(self, hand: str, source: str | None = None) -> Path:
-        """Return the MJCF file of a hand with its actuators.
+        """Return the MJCF file of a hand, which includes its actuators.
 
         Raises:
             UnknownNameError: the hand is not in the library (or not from that source).
@@ -247,7 +250,7 @@ class Library:
 
     @property
     def is_filled(self) -> bool:
-        """Whether there are a table and the benchmark's hands."""
+        """Whether ``checkout`` or ``registry`` is present, which have the table and the hands."""
         return bool(self._whole())
 
     def _whole(self) -> list[str]:
@@ -288,26 +291,26 @@ class Library:
         return path
 
     def _check_unchanged(self, source: str, relative: str) -> None:
-        """Compare a file, and for a model its meshes, with the manifest; once."""
+        """Check a file's hash, and those of a model's meshes, against the manifest; only once."""
         if (source, relative) in self._unchanged:
             return
         model = f"{relative.rpartition('/')[0]}/" if relative.endswith(".xml") else relative
         for name, entry in self._sources[source].files.items():
             path = self._folders[source] / name
             if name.startswith(model) and path.is_file() and sha256_of(path) != entry.sha256:
-                own = "Create it again with 'pgdm author', or get your copy back."
+                own = "Create it again with 'pgdm author', or restore it from a copy."
                 raise CorruptAssetError(
-                    f"{path}: was changed after it came into the library, its SHA-256 is not the "
-                    f"recorded one. {own if source == staging.OWN else CURE}"
+                    f"{path}: was changed after it came into the library: its SHA-256 differs from "
+                    f"the recorded one. {own if source == staging.OWN else CURE}"
                 )
         self._unchanged.add((source, relative))
 
 
 def open_library(root: Path | None = None) -> Library:
-    """Open the library; reads only its manifests.
+    """Open the library; only its manifests are read.
 
     Args:
-        root: its folder, by default the one under ``PGDM_HOME``.
+        root: the library's folder, by default the one under ``PGDM_HOME``.
 
     Raises:
         CorruptAssetError: the manifest of ``checkout`` or ``registry`` is damaged, and neither can
@@ -324,13 +327,13 @@ def open_library(root: Path | None = None) -> Library:
             damaged[source] = error
     for source, error in damaged.items():
         if source in staging.SELF_CONTAINED and not set(found) & set(staging.SELF_CONTAINED):
-            raise error  # nothing else has the benchmark's hands
+            raise error  # no other source has the benchmark's hands
         _log.warning("%s; continuing without %s", error, _NAMES.get(source, f"source '{source}'"))
     return Library(root, found, folders).serving(staging.preferred(root))
 
 
 def present(root: Path) -> dict[str, Path]:
-    """Return the folder of each source that is there, damaged or not, in order of precedence."""
+    """Return the folder of each existing source, damaged or not, in default order of precedence."""
     found = {source: staging.folder_of(*_place(root, source)) for source in staging.SOURCES}
     return {source: folder for source, folder in found.items() if folder is not None}
 

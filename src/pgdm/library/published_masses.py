@@ -1,8 +1,9 @@
-"""Ratio of objects' masses in MuJoCo 2.2, from the paper's time, to those in MuJoCo 4.0.
+"""Ratio of each object's mass in MuJoCo 2.2, current when the paper appeared, to that in 4.0.
 
 Each object of a TCDM checkout was compiled with both versions, which compute the volume of a mesh
-differently; in 4.0 the mass is density times true volume. Objects with a given mass or made of
-boxes have ratio 1. Centres of mass also differ, by up to 1.6 mm; this is not corrected.
+differently; in 4.0 the mass is density times true volume. Objects that are made of boxes or whose
+model states the mass have ratio 1. Centres of mass also differ, by up to 1.6 mm; this is not
+corrected.
 """
 
 from __future__ import annotations
@@ -70,4 +71,4 @@ RATIOS: dict[str, float] = {
     "wineglass": 0.9571,
     "wristwatch": 0.9512,
 }
-"""Name of an object -> its mass in MuJoCo 2.2 / its mass in MuJoCo 4.0."""
+"""Mass in MuJoCo 2.2 divided by mass in MuJoCo 4.0, by name of the object."""

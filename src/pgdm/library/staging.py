@@ -1,7 +1,7 @@
 """Atomic changes to the library.
 
-A folder of the library is written under a temporary name and takes the old one's place by renaming,
-under a lock that other processes wait for. Readers ignore whatever an interrupted change leaves
+A change writes a folder under a temporary name, then renames it to replace the old folder, while
+holding a lock that other writers wait for. Readers ignore whatever an interrupted change leaves
 behind; the next change removes it.
 """
 
@@ -24,22 +24,22 @@ from pgdm.library.progress import Notify
 from pgdm.paths import replacing
 
 SELF_CONTAINED = ("checkout", "registry")
-"""Library sources with their own hands and table scene, by decreasing precedence."""
+"""Library sources that include hands and the table scene, in default order of precedence."""
 
 OWN = "own"
-"""Library source of the user's objects, hands and tasks; it is in the user's folder."""
+"""Library source of the user's objects, hands and tasks; stored in :func:`pgdm.paths.user`."""
 
 ANIMATED = "animated"
 """Library source of the motions that come with pgdm, compiled from keyframes."""
 
 SOURCES = (OWN, *SELF_CONTAINED, ANIMATED)
-"""Library sources by decreasing precedence."""
+"""Library sources in default order of precedence."""
 
 EXPERTS = "experts"
-"""Folder of the expert hand trajectories. They belong to no source: they fit the motions of
-both `checkout` and `registry`."""
+"""Folder of the expert hand trajectories. They belong to no library source, because they fit
+the motions of both `checkout` and `registry`."""
 
-_TIMEOUT_S = 3600.0  # fetching over a slow connection takes long
+_TIMEOUT_S = 3600.0  # enough for a fetch over a slow connection
 _STAGING, _PREVIOUS = ".staging-", ".previous-"
 _FIRST = "first-source"
 _log = logging.getLogger(__name__)
@@ -47,14 +47,15 @@ _log = logging.getLogger(__name__)
 
 @contextmanager
 def locked(root: Path, timeout_s: float = _TIMEOUT_S) -> Iterator[None]:
-    """Hold the lock of a library; it is not reentrant.
+    """Hold the lock of a library, which is not reentrant.
 
     Args:
         root: the library.
         timeout_s: how long to wait for another process.
 
     Raises:
-        LibraryError: the folder cannot be written, or another process holds the lock too long.
+        LibraryError: the folder cannot be written, or another process held the lock for
+            ``timeout_s``.
     """
     busy = f"{root}: another process has been changing the library for {timeout_s:.0f} s"
     waiting = f"another process is changing the library in {root}: waiting for it"
@@ -73,7 +74,7 @@ def making(path: Path, notify: Notify) -> Iterator[None]:
     """Hold the lock of one file while it is computed; other processes wait.
 
     Raises:
-        LibraryError: the folder cannot be written, or another process holds the lock too long.
+        LibraryError: the folder cannot be written, or another process held the lock for an hour.
     """
     busy = f"{path}: another process has been computing it for {_TIMEOUT_S:.0f} s"
     waiting = f"another process is computing {path}: waiting for it"
@@ -112,12 +113,12 @@ def replacing_folder(root: Path, relative: str) -> Iterator[Path]:
 
     Args:
         root: the locked folder.
-        relative: the folder to replace, at most two levels below, such as ``objects/cup``.
+        relative: the folder to replace, at most two levels below ``root``, as ``objects/cup``.
     """
     _clear(root)
     target = root / relative
     fresh = Path(tempfile.mkdtemp(prefix=f"{_STAGING}{target.name}-", dir=root))
-    # mkdtemp makes it private, but a library may be shared like any other folder.
+    # mkdtemp makes the folder private, but other users may read a library.
     fresh.chmod(0o755)
     try:
         yield fresh
@@ -132,7 +133,7 @@ def replacing_folder(root: Path, relative: str) -> Iterator[Path]:
 
 
 def folder_of(root: Path, source: str) -> Path | None:
-    """Return the folder that a library source is read from, None if missing.
+    """Return the folder from which a library source is read, None if missing.
 
     If a change was interrupted between its two renames, the previous content is used.
     """
@@ -143,7 +144,7 @@ def folder_of(root: Path, source: str) -> Path | None:
 
 
 def prefer(root: Path, source: str) -> None:
-    """Have a library source serve every task that it has, before all others but ``own``."""
+    """Give a library source precedence over all others except ``own``."""
     with locked(root), replacing(root / _FIRST) as temp:
         temp.write_text(f"{source}\n", encoding="utf-8")
 
@@ -160,17 +161,17 @@ def remove(root: Path, source: str) -> None:
     """Delete a library source.
 
     Raises:
-        LibraryError: the folder cannot be written, or another process holds the lock too long.
+        LibraryError: the folder cannot be written, or another process held the lock for an hour.
     """
     with locked(root):
         _clear(root)
-        gone = root / f"{_STAGING}{source}-removed"  # a reader sees all of it or nothing
+        gone = root / f"{_STAGING}{source}-removed"  # readers see all of it or nothing
         os.replace(root / source, gone)
         shutil.rmtree(gone)
 
 
 def _clear(root: Path) -> None:
-    """Remove what interrupted changes left; put a folder back whose replacement never arrived."""
+    """Remove leftovers of interrupted changes; restore a folder moved aside but never replaced."""
     for leftover in root.glob(f"{_STAGING}*"):
         _log.info("removing %s, left by an interrupted change", leftover.name)
         shutil.rmtree(leftover, ignore_errors=True)

@@ -1,7 +1,8 @@
 """The benchmark's 51 tasks: their ids, and the hand and objects that an id names.
 
-``<object>-<motion>`` is a task of the Adroit hand, ``<hand>-<object>`` one of another hand; the
-exceptions are in a table. A task's settings and published results are in ``conf/task/<id>.yaml``.
+``<object>-<motion>`` is a task of the Adroit hand, ``<hand>-<object>`` a task of another hand;
+``_SPECIAL_OBJECTS`` lists the exceptions. A task's settings and published results are in
+``conf/task/<id>.yaml``.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ HANDS = ("adroit", "dhand", "dmanus")
 """Hands of the benchmark."""
 
 STEP_S = 0.04
-"""Duration of a control step of every task, s."""
+"""Duration of a control step, s; ``hammer-strike`` alone has 0.02 s."""
 SUBSTEPS = 10
 """Physics steps per control step of every task."""
 
@@ -32,7 +33,7 @@ CHECKOUT_TASKS = (
     *("dmanus-coffeecan", "dmanus-crackerbox", "dmanus-sim2real", "door-open", "hammer-strike"),
     "spheremedium-relocate",
 )
-"""Tasks that only a TCDM checkout has."""
+"""Tasks that only a checkout of TCDM, the paper authors' repository, has."""
 
 BENCHMARK_TASKS = (*MOCAP_TASKS, *CHECKOUT_TASKS)
 """All tasks of the benchmark."""
@@ -43,10 +44,10 @@ GRAB_COPIES = frozenset(
         *("dhand-waterbottle", "dmanus-coffeecan"),
     }
 )
-"""Tasks of other hands whose motion is a motion-capture task's, or nearly so."""
+"""D'Hand and D'Manus tasks whose motion is, at least nearly, that of a motion-capture task."""
 
 REBUILT_EXPERTS = ("alarmclock-see1", "binoculars-pass1", "piggybank-use1", "waterbottle-shake1")
-"""Motion-capture tasks whose published expert hand trajectory is empty; it can be rebuilt."""
+"""Motion-capture tasks whose published expert trajectory is an empty file; pgdm can rebuild it."""
 
 _SPECIAL_OBJECTS: dict[str, tuple[str, ...]] = {
     "hammer-strike": ("dapg_hammer", "nail"),

@@ -1,4 +1,4 @@
-"""Filling the library from a checkout of TCDM or from its data tree."""
+"""Filling the library from a checkout of TCDM, the paper authors' repository, or from its data."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pgdm.library.files.motion import Start
 from pgdm.library.progress import StepProgress, silent
 
 _STARTS = {"motion_planned": "planned", "initialized": "mined", "learned": "learned"}
-"""TCDM's names of the start states, and ours."""
+"""TCDM's name of each start state, and pgdm's."""
 
 _GRAB_LICENCE = "MIT, motions derived from GRAB"
 
@@ -33,16 +33,16 @@ class Tree:
     root: Path
     """Common parent; names in messages are relative to it."""
     assets: Path
-    """Folder with ``common.xml``, ``robots``, ``objects``."""
+    """Folder that contains ``common.xml``, ``robots`` and ``objects``."""
     trajectories: Path
-    """Folder with the ``.npz`` files."""
+    """Folder of the motions' ``.npz`` files."""
 
 
 def locate(path: Path) -> Tree:
     """Find the data in a checkout, in its ``tcdm`` package, or in its assets folder.
 
     Raises:
-        LibraryError: it is none of these; names what is missing.
+        LibraryError: the folder is none of these; the message names what is missing.
     """
     path = Path(os.path.abspath(paths.expanded(path)))
     if not path.is_dir():
@@ -71,10 +71,11 @@ def import_tcdm(
         path: the checkout, its ``tcdm`` package or its assets folder.
         root: the library.
         progress: receives the number of files.
-        replace: also if tasks that the library has from a checkout would be lost.
+        replace: import even if tasks are lost that an earlier checkout provided.
 
     Raises:
-        LibraryError: it is not such a folder, or the library cannot be written.
+        LibraryError: the folder is not a checkout or has no complete task, tasks would be lost, or
+            the library cannot be written.
         CorruptAssetError: a file is damaged; the library remains unchanged.
     """
     tree = locate(path)
@@ -100,7 +101,7 @@ def _refuse_loss(root: Path, summary: ImportSummary, replace: bool) -> None:
     try:
         lost = sorted(set(manifest.read(present).tasks) - set(summary.tasks))
     except CorruptAssetError:
-        return  # anything intact may replace a damaged source
+        return  # an intact checkout may always replace a damaged source
     if lost:
         raise LibraryError(
             f"{len(lost)} tasks now in the library are not in this folder ({', '.join(lost[:5])}"
@@ -150,7 +151,7 @@ def _add_motions(tree: Tree, builder: SourceBuilder, progress: StepProgress) -> 
     for i, file in enumerate(files):
         task = tasks.task_id(file.stem)
         progress(f"task {task}", i, len(files))
-        # Read even if the task lacks something: a damaged file is always refused.
+        # Read even if the task's models are missing: a damaged file is always refused.
         model_file.check_stays(file, tree.root)
         arrays = normalised(npz.read_npz(file), model_file.name_in(file, tree.root))
         lacking = builder.lacking(task)
@@ -164,8 +165,8 @@ def _add_motions(tree: Tree, builder: SourceBuilder, progress: StepProgress) -> 
 def normalised(arrays: Mapping[str, Any], label: str) -> dict[str, np.ndarray]:
     """Convert the arrays of a TCDM trajectory to the library's form.
 
-    Three released files have more poses than their ``length``; only ``length`` of them are used, as
-    in the released code.
+    Three released files have more poses than their ``length``; only the first ``length`` poses are
+    used, as in the released code.
 
     Raises:
         CorruptAssetError: an array is missing, of a wrong shape, or not finite.

@@ -1,1 +1,1 @@
-"""The user's own objects and motions."""
+"""The library source ``own``: the user's objects, hands and motions."""

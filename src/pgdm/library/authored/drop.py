@@ -1,4 +1,4 @@
-"""Dropping an object onto the table, to check that it comes to rest there."""
+"""The drop test: does an object dropped onto the table come to rest there?"""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from pgdm.library.checks.compiled import compile_tracked
 from pgdm.library.checks.lowest import lowest
 
 HEIGHT_M = 0.005
-"""Initial height of the lowest point."""
-TIME_S = 4.0
+"""Initial height of the object's lowest point above the table."""
+TIME_S = 4.0  # duration of the simulation
 SINK_M = 0.002
-"""Largest final depth of the lowest point in the table; the contact margin is 0.5 mm."""
+"""Largest final depth of the lowest point below the table top; the contact margin is 0.5 mm."""
 DRIFT_M = 0.03
-"""Largest horizontal displacement in the second half of the time."""
-REST_M_S, REST_RAD_S = 0.01, 0.1
+"""Largest horizontal displacement in the second half of the simulation."""
+REST_M_S, REST_RAD_S = 0.01, 0.1  # largest final speeds
 _TABLE = """<mujoco><option timestep="0.004" iterations="20" noslip_iterations="20"/>
 <default><geom friction="1 0.5 0.01" margin="0.0005"/></default>
 <worldbody><geom type="box" size="0.45 0.45 0.025" pos="0 0 -0.025"/></worldbody></mujoco>"""
@@ -31,16 +31,16 @@ class Drop:
     """Final state of a dropped object."""
 
     qpos: np.ndarray  # (6,) joint positions, m and rad
-    quat: np.ndarray  # (4,) wxyz, orientation
-    com: np.ndarray  # (3,) m, centre of mass
+    quat: np.ndarray  # (4,) wxyz, orientation, world frame
+    com: np.ndarray  # (3,) m, centre of mass, world frame
     turned_rad: float
     """Angle of the rotation from the initial orientation."""
     sunk_m: float
-    """Depth of its lowest point in the table."""
+    """Depth of its lowest point below the table top."""
     drift_m: float
-    """Horizontal displacement of its centre of mass in the second half of the time."""
-    speed_m_s: float
-    turn_rad_s: float
+    """Horizontal displacement of its centre of mass in the second half of the simulation."""
+    speed_m_s: float  # of the centre of mass
+    turn_rad_s: float  # angular speed
 
     @property
     def rests(self) -> bool:
@@ -55,9 +55,9 @@ def drop(
     """Drop an object from a few millimetres above the table.
 
     Args:
-        object_xml: its model.
-        place: initial position of its centre of mass, (x, y) m.
-        turn: initial orientation; None: that of its model.
+        object_xml: MJCF of the object.
+        place: initial horizontal position of the centre of mass, (x, y) m.
+        turn: initial orientation; None: as in the model.
 
     Raises:
         LibraryError: the simulation diverges.

@@ -1,7 +1,8 @@
-"""Reading a user's hand, MJCF or URDF, into one plain MJCF; nothing in the file is executed.
+"""Reading a user's hand from MJCF or URDF into one plain MJCF, without executing anything in it.
 
-The XML is checked before MuJoCo sees it: no entities, no plug-ins, no file outside of its folder,
-no NaN. MuJoCo then parses and compiles it in a child process with limits of time and memory.
+The XML is checked before MuJoCo sees it: no entities, no plug-ins, no file outside a given
+folder, no NaN. MuJoCo then parses and compiles it in a child process with limits of time and
+memory.
 """
 
 from __future__ import annotations
@@ -22,21 +23,21 @@ from pgdm.library.files import mjcf
 from pgdm.library.files.model import check_stays
 
 MESHES = (".stl", ".obj", ".msh")
-"""Formats of meshes that MuJoCo reads."""
+"""Mesh formats that MuJoCo reads."""
 MOST_JOINTS, MOST_BODIES = 60, 300
 
-_SECONDS = 60  # CPU time, of compiling
+_SECONDS = 60  # limit of CPU time for reading and compiling
 _DEFINITIONS = re.compile(rb"<!(DOCTYPE|ENTITY)", re.IGNORECASE)
 _REFUSED = ("extension", "plugin", "composite", "flexcomp", "skin", "replicate", "model", "attach")
 _SINGLE = ("revolute", "prismatic", "fixed")  # URDF joints
 _WORDS = re.compile(r"[+-]?(nan|inf|infinity)", re.IGNORECASE)
-# What a hand does not need; keyframes and sensors would name joints that change.
+# Dropped: a hand does not need these, and keyframes and sensors depend on joints that pgdm changes.
 _DROPPED = ("keyframe", "sensor", "statistic", "visual", "custom", "size", "option")
 
 
 @dataclass(frozen=True)
 class HandFile:
-    """A hand as read: one MJCF whose meshes have absolute paths."""
+    """A hand as one MJCF whose meshes have absolute paths, with facts about its file."""
 
     xml: str = field(repr=False)
     kind: str
@@ -44,21 +45,21 @@ class HandFile:
     notes: list[str]
     """What was changed or left out, one sentence each."""
     mimics: list[str]
-    """Joints that follow another, such as ``b = 0.1 + 0.9 a``."""
+    """Coupled joints, each as an equation such as ``b = 0.1 + 0.9 a``."""
     bytes: int
-    """Size of file and meshes together."""
+    """Total size of the file and its meshes."""
 
 
 def read(path: Path, root: Path | None = None) -> HandFile:
     """Read a hand's file and check it.
 
     Args:
-        path: MJCF or URDF.
-        root: folder that its meshes and includes must not leave; by default its own.
+        path: MJCF or URDF file.
+        root: folder in which its meshes and includes must be; by default the file's folder.
 
     Raises:
-        CorruptAssetError: it is unreadable, hostile, or not a hand that MuJoCo can compile.
-        ConfigError: it is outside of ``root``.
+        CorruptAssetError: the file is unreadable, unsafe, or not a hand that MuJoCo can compile.
+        ConfigError: the file is outside ``root``.
     """
     path = Path(os.path.abspath(path))
     root = path.parent if root is None else Path(os.path.abspath(root))
@@ -91,7 +92,7 @@ def _read(path: Path, root: Path) -> HandFile:
 
 
 def _element(path: Path, label: str, root: Path, parents: tuple[Path, ...]) -> ET.Element:
-    """Parse a file and insert what it includes."""
+    """Parse a file and insert the content of its includes."""
     if path in parents:
         raise CorruptAssetError(f"{label}: includes itself")
     try:
@@ -143,7 +144,7 @@ def _check_numbers(element: ET.Element, label: str) -> None:
 
 
 def _inside(name: str, folder: Path, root: Path, label: str) -> Path:
-    """Return the file of a name; a ROS package is looked for in the root and below it."""
+    """Resolve a file name; seek ``package://`` paths in ``root``, also without first folders."""
     if name.startswith("package://"):
         rest = Path(name.removeprefix("package://"))
         places = [root / rest, *(root / Path(*rest.parts[k:]) for k in range(1, len(rest.parts)))]
@@ -162,7 +163,7 @@ def _inside(name: str, folder: Path, root: Path, label: str) -> Path:
 
 
 def _mjcf(element: ET.Element, path: Path, root: Path, notes: list[str]) -> list[Path]:
-    """Check an MJCF and make its paths absolute; return its files."""
+    """Check an MJCF, make its paths absolute and simplify it; return the files it refers to."""
     for item in element.iter():
         if item.tag in _REFUSED:
             raise CorruptAssetError(f"{path.name}: has <{item.tag}>, which pgdm does not load")
@@ -173,7 +174,7 @@ def _mjcf(element: ET.Element, path: Path, root: Path, notes: list[str]) -> list
         folders["texture"] = compiler.attrib.pop("texturedir", both or folders["texture"])
         strips = compiler.attrib.pop("strippath", "false") == "true"
         if strips:
-            notes.append("mesh paths were not stripped of their folders")
+            notes.append("strippath was ignored: mesh paths keep their folders")
     found = []
     for item in element.iter():
         for key in [key for key in item.attrib if key.startswith("file")]:
@@ -199,7 +200,7 @@ def _mjcf(element: ET.Element, path: Path, root: Path, notes: list[str]) -> list
 
 
 def _urdf(robot: ET.Element, path: Path, root: Path, notes: list[str]) -> list[Path]:
-    """Check a URDF, make its paths absolute and resolve chains of ``<mimic>``."""
+    """Check a URDF, make paths absolute and resolve chains of ``<mimic>``; return its meshes."""
     for joint in robot.findall("joint"):
         name, kind = joint.get("name"), joint.get("type", "")
         if kind not in _SINGLE:
@@ -210,10 +211,10 @@ def _urdf(robot: ET.Element, path: Path, root: Path, notes: list[str]) -> list[P
         limit = joint.find("limit")
         if kind != "fixed" and (limit is None or not _has_range(limit)):
             raise CorruptAssetError(
-                f"{path.name}: joint '{name}' has no limits; write <limit lower= upper=> into it"
+                f"{path.name}: joint '{name}' has no limits; add <limit lower= upper=> to it"
             )
         if limit is not None and float(limit.get("effort") or 0) <= 0:
-            limit.attrib.pop("effort", None)  # MuJoCo would allow no force at all
+            limit.attrib.pop("effort", None)  # otherwise MuJoCo would limit the force to zero
     _resolve_mimics(robot, path.name)
     for old in robot.findall("mujoco"):
         robot.remove(old)
@@ -256,7 +257,7 @@ def _has_range(limit: ET.Element) -> bool:
 
 
 def _resolve_mimics(robot: ET.Element, label: str) -> None:
-    """Let each mimic joint follow one that follows none: q = m (m' q' + o') + o."""
+    """Make each mimic joint follow a joint that mimics none: q = m (m' q' + o') + o."""
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
     for name, joint in joints.items():
         mimic = joint.find("mimic")
@@ -267,10 +268,10 @@ def _resolve_mimics(robot: ET.Element, label: str) -> None:
             leader = mimic.get("joint")
             if leader not in joints:
                 raise CorruptAssetError(
-                    f"{label}: joint '{name}' mimics '{leader}', which is no joint of the hand"
+                    f"{label}: joint '{name}' mimics '{leader}', which is not a joint of the hand"
                 )
             if leader in seen:
-                raise CorruptAssetError(f"{label}: joint '{name}' mimics itself in a circle")
+                raise CorruptAssetError(f"{label}: joint '{name}' mimics itself, forming a cycle")
             above = joints[leader].find("mimic")
             if above is None:
                 break
@@ -286,11 +287,11 @@ def _line(mimic: ET.Element, label: str) -> tuple[float, float]:
     try:
         return float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
     except ValueError as error:
-        raise CorruptAssetError(f"{label}: <mimic> has no number ({error})") from error
+        raise CorruptAssetError(f"{label}: <mimic> holds a non-number ({error})") from error
 
 
 def _compiled(xml: str, label: str, notes: list[str]) -> mujoco.MjSpec:
-    """Return the compiled spec; inertias that no body can have are corrected and reported."""
+    """Return the spec after a test compile; impossible inertias are corrected and noted."""
     for balance in (False, True):
         try:
             spec = mujoco.MjSpec.from_string(xml)
@@ -302,7 +303,7 @@ def _compiled(xml: str, label: str, notes: list[str]) -> mujoco.MjSpec:
                 continue
             raise CorruptAssetError(f"{label}: MuJoCo cannot compile it ({reason})") from error
         if balance:
-            notes.append("inertias that no body can have (A + B < C) were replaced by their mean")
+            notes.append("physically impossible inertias (A + B < C) were replaced by their mean")
         if not 0 < model.njnt <= MOST_JOINTS:
             raise CorruptAssetError(f"{label}: {model.njnt} joints; a hand has 1 to {MOST_JOINTS}")
         spec.compiler.balanceinertia = False
@@ -311,7 +312,7 @@ def _compiled(xml: str, label: str, notes: list[str]) -> mujoco.MjSpec:
 
 
 def _explicit(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjSpec:
-    """Write the corrected inertias into the spec."""
+    """Copy the corrected inertias from the model into the spec."""
     for body in _bodies(spec):
         if body.explicitinertial:
             body.inertia = model.body(body.name).inertia

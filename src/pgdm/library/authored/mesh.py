@@ -15,18 +15,19 @@ SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".off")
 """Supported formats."""
 
 UNITS_M = {"mm": 0.001, "cm": 0.01, "m": 1.0}
-"""Units of meshes, in m."""
+"""Length of each mesh unit, m."""
 
 SIZES_M = (0.02, 0.6)
-"""Least and largest longest side of an object that a hand can manipulate above the table, m."""
+"""Smallest and largest accepted longest side of an object, m, for a hand to manipulate it."""
 
 MAX_FACES = 20_000
-"""Largest number of faces: more are not visible, and MuJoCo refuses 200,000."""
+"""Meshes with more faces are simplified: a difference is not visible, and MuJoCo refuses more than
+200,000."""
 
-_THIN_M = 5e-4  # thinner objects fall through the contact margin
-_OPEN_SHARE = 0.5  # least share of its hull in an open surface, for the hull's volume to be used
+_THIN_M = 5e-4  # the models' contact margin; an object must be thicker
+_OPEN_SHARE = 0.5  # an open surface with a smaller share of its hull's volume is refused
 _MAX_BODIES = 50
-_LID_SHARE = 0.15  # largest share of the surface that is filled in
+_LID_SHARE = 0.15  # holes are filled if the lids have at most this share of the surface's area
 _READ_ERRORS = (
     *(ValueError, TypeError, KeyError, IndexError, AttributeError, AssertionError),
     *(NotImplementedError, ImportError, EOFError, struct.error, OSError, RuntimeError),
@@ -43,7 +44,7 @@ class SoundMesh:
     faces: np.ndarray = field(repr=False)
     """(F, 3) vertex numbers, counter-clockwise seen from outside."""
     closed: bool
-    """Whether the surface encloses a volume; if not, the hull's volume is used."""
+    """Whether the surface encloses a volume; if not, ``volume_m3`` is the hull's."""
     volume_m3: float
     hull_m3: float
     """Volume of the convex hull."""
@@ -53,7 +54,7 @@ class SoundMesh:
     """What was changed, one sentence each."""
 
     def trimesh(self) -> trimesh.Trimesh:
-        """Return it as trimesh's own class."""
+        """Return the mesh as a ``trimesh.Trimesh``."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
@@ -63,10 +64,11 @@ def read(path: Path, scale: float = 1.0, allow_open: bool = False) -> SoundMesh:
     Args:
         path: STL, OBJ, PLY, GLB or OFF.
         scale: metres per unit of the file.
-        allow_open: accept a surface that is far from closed, because its mass is known.
+        allow_open: accept a surface that is far from closed, as the object's mass is known.
 
     Raises:
-        ConfigError: the size is implausible in this unit; suggests a unit.
+        ConfigError: the format is not supported, there is no such file, or the size is implausible
+            in this unit; the message suggests a unit.
         CorruptAssetError: the file is unreadable, empty, flat, or encloses no volume.
     """
     mesh = _load(path)
@@ -109,10 +111,10 @@ def _check_size(mesh: trimesh.Trimesh, label: str, scale: float) -> None:
     if low <= longest <= high:
         return
     if longest <= 0.0:
-        raise CorruptAssetError(f"{label}: all its vertices are one point")
+        raise CorruptAssetError(f"{label}: all its vertices coincide")
     fitting = {u: longest / scale * f for u, f in UNITS_M.items()}
     fitting = {u: size for u, size in fitting.items() if low <= size <= high}
-    # The largest plausible one: hands manipulate objects of decimetres rather than of centimetres.
+    # Prefer the largest plausible size: objects of decimetres are more common than of centimetres.
     unit = max(fitting, key=lambda u: fitting[u]) if fitting else None
     guess = (
         f"it looks like {unit} ({length(fitting[unit])}): use --unit {unit}"
@@ -137,12 +139,12 @@ def _clean(mesh: trimesh.Trimesh, label: str, repairs: list[str]) -> None:
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if merged := before - len(mesh.vertices):
         repairs.append(f"merged {merged} vertices at the same place")
-    # Relative to the size: by trimesh's own bound the faces of a fine scan are degenerate.
+    # Relative to the mesh's size: trimesh's absolute bound would drop faces of fine scans.
     sound = mesh.area_faces > 1e-12 * mesh.scale**2
     if not sound.any():
-        raise CorruptAssetError(f"{label}: none of its {len(sound)} faces has an area")
+        raise CorruptAssetError(f"{label}: all of its {len(sound)} faces have zero area")
     if not sound.all():
-        repairs.append(f"removed {int((~sound).sum())} faces without area")
+        repairs.append(f"removed {int((~sound).sum())} faces of zero area")
         mesh.update_faces(sound)
     unique = mesh.unique_faces()
     if not unique.all():
@@ -152,7 +154,7 @@ def _clean(mesh: trimesh.Trimesh, label: str, repairs: list[str]) -> None:
     thinnest = float(mesh.extents.min())
     if thinnest < _THIN_M:
         raise CorruptAssetError(
-            f"{label}: is flat, its shortest side is {length(thinnest)}; an object needs "
+            f"{label}: is flat, with a shortest side of {length(thinnest)}; an object needs "
             f"{length(_THIN_M)} or more"
         )
 
@@ -185,12 +187,12 @@ def _close(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bo
 
 
 def _fill(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> None:
-    """Fill holes, unless the lid would turn a bowl into a solid."""
+    """Fill small holes; refuse a large opening, such as a bowl's, or leave it open if allowed."""
     share = opening(mesh) / float(mesh.area)
     if share > _LID_SHARE:
         if not allow_open:
             raise CorruptAssetError(
-                f"{label}: its surface is open, a lid would have {share:.0%} of its area, so its "
+                f"{label}: its surface is open; a lid would have {share:.0%} of its area, so its "
                 "volume is unknown; close it in your mesh editor, or give --mass KG"
             )
         repairs.append(f"left its opening open: a lid would have {share:.0%} of its area")
@@ -208,9 +210,9 @@ def _fill(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: boo
 
 
 def is_closed(mesh: trimesh.Trimesh) -> bool:
-    """Return whether a surface encloses a volume: faces traverse each edge equally often each way.
+    """Return whether a surface is closed: faces traverse each edge equally often in each direction.
 
-    So an edge along which two closed pieces touch, which has four faces, does not open them.
+    This also accepts an edge of four faces, along which two closed pieces touch.
     """
     edges, count = mesh.edges.astype(np.int64), len(mesh.vertices)
     there, back = edges @ [count, 1], edges @ [1, count]
@@ -220,7 +222,8 @@ def is_closed(mesh: trimesh.Trimesh) -> bool:
 def opening(mesh: trimesh.Trimesh) -> float:
     """Return the total area of flat lids on the holes of a surface, m2.
 
-    The area vector of a closed line is half the sum of a x b over its edges, for any origin.
+    The area vector of a closed line is half the sum of a x b over its edges from a to b, for any
+    origin.
     """
     edges = _rims(mesh)
     if not len(edges):
@@ -233,12 +236,12 @@ def opening(mesh: trimesh.Trimesh) -> float:
 
 
 def _rims(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Return the edges (E, 2) of only one face, in the direction in which it traverses them."""
+    """Return the edges (E, 2) that only one face has, in the direction of that face's winding."""
     return mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
 
 
 def _holes(edges: np.ndarray, num_vertices: int) -> np.ndarray:
-    """Return the number of the hole, from 0, of each edge (E, 2) of the rims."""
+    """Return for each rim edge (E, 2) the index (E,) of the hole that it borders."""
     label = trimesh.graph.connected_component_labels(edges, node_count=num_vertices)
     return np.unique(label[edges[:, 0]], return_inverse=True)[1]
 
@@ -253,7 +256,7 @@ def _measured(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open:
     try:
         hull = float(mesh.convex_hull.volume)
     except (ValueError, RuntimeError, IndexError) as error:  # Qhull: all points in one plane
-        raise CorruptAssetError(f"{label}: is flat, it has no convex hull") from error
+        raise CorruptAssetError(f"{label}: is flat and has no convex hull") from error
     closed, volume = is_closed(mesh), abs(float(mesh.volume))
     if closed and volume < 1e-4 * hull:
         raise CorruptAssetError(
@@ -261,7 +264,7 @@ def _measured(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open:
             f"{1e6 * hull:.3g} cm3 of its convex hull"
         )
     if not closed:
-        # About its centre: the volume of an open surface depends on the origin.
+        # About the mesh's centre, as the computed volume of an open surface depends on the origin.
         centred = mesh.copy()
         centred.apply_translation(-mesh.vertices.mean(axis=0))
         share = abs(float(centred.volume)) / hull

@@ -1,4 +1,4 @@
-"""A new object from a mesh: checked, decomposed, weighed, dropped, and stored in ``own``."""
+"""Creating an object from a mesh: checks, convex parts, mass, drop test; stored in ``own``."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ DENSITY = 1250.0
 
 _DENSITIES = (10.0, 20_000.0)  # foam to gold, kg/m3
 _UPRIGHT_RAD = 0.1
-_READING_S = 60  # CPU time; large scans are simplified meanwhile
-_RGBA = "0.16 0.45 0.65 1"  # blue: the hands and the other objects are brown and black
+_READING_S = 60  # CPU time, which includes simplifying large scans
+_RGBA = "0.16 0.45 0.65 1"  # blue, as the hands and other objects are brown and black
 _MASSES = (0.001, 10.0)  # kg; the benchmark's hands hold 2 kg at most
 
 
 @dataclass(frozen=True)
 class ObjectRequest:
-    """An object to create."""
+    """Description of an object to create."""
 
     mesh: Path
     """STL, OBJ, PLY, GLB or OFF."""
@@ -44,11 +44,11 @@ class ObjectRequest:
     scale: float = 1.0
     """Metres per unit of the file."""
     mass_kg: float | None = None
-    """Mass, if known; None: from the density."""
+    """Mass, if known; None: computed from the density."""
     density: float = DENSITY
     """kg/m3; used if no mass is given."""
     parts: PartsCfg = field(default_factory=PartsCfg)
-    """How finely it is decomposed."""
+    """How finely the mesh is decomposed into convex parts."""
     licence: str = "unstated"
     """Licence of the mesh, its SPDX name if it has one."""
     replace: bool = False
@@ -60,13 +60,13 @@ class Body:
     """Mass and inertia of a rigid object, in the frame of its mesh."""
 
     mass_kg: float
-    com: np.ndarray  # (3,) m
+    com: np.ndarray  # (3,) m, centre of mass
     inertia: np.ndarray  # (3, 3) kg m2, about the centre of mass, axes of the mesh
 
 
 @dataclass(frozen=True)
 class AuthoredObject:
-    """A new object."""
+    """A newly created object."""
 
     name: str
     folder: Path
@@ -76,7 +76,7 @@ class AuthoredObject:
     drop: Drop
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return the object's properties, a name and a text each."""
+        """Return the object's properties as pairs of name and text, for a table."""
         mesh, sides = self.mesh, np.ptp(self.mesh.vertices, axis=0)
         whole = sum(part.trimesh().volume for part in self.parts)
         kind = "closed" if mesh.closed else "open, its hull is used"
@@ -87,7 +87,10 @@ class AuthoredObject:
             ("volume", f"{1e6 * mesh.volume_m3:.1f} cm3"),
             ("share of its hull", f"{mesh.volume_m3 / mesh.hull_m3:.2f}"),
             ("mass", f"{1e3 * self.body.mass_kg:.1f} g"),
-            ("convex parts", f"{len(self.parts)}, together {whole / mesh.volume_m3:.2f} volumes"),
+            (
+                "convex parts",
+                f"{len(self.parts)}, total {whole / mesh.volume_m3:.2f} of the volume",
+            ),
             ("drop test", drop_text(self.drop)),
         ]
 
@@ -106,18 +109,19 @@ def drop_text(found: Drop) -> str:
 
 
 def author_object(request: ObjectRequest, progress: StepProgress = silent) -> AuthoredObject:
-    """Create an object of the user's from a mesh.
+    """Create an object in the source ``own`` from a mesh.
 
-    Its frame has the mesh's axes and its origin in the centre of mass.
+    The object's frame has the mesh's axes and its origin at the centre of mass.
 
     Args:
-        request: the object.
+        request: the object to create.
         progress: receives the progress of the convex decomposition.
 
     Raises:
         ConfigError: a value is out of range, or the name is taken.
-        CorruptAssetError: the mesh cannot be used; gives the reason.
-        LibraryError: the user's folder cannot be written.
+        CorruptAssetError: the mesh cannot be used; the message gives the reason.
+        LibraryError: the mesh cannot be decomposed, the drop test diverges, or the user's folder
+            cannot be written.
     """
     _check(request)
     own.check_object_name(request.name, request.replace)
@@ -142,7 +146,7 @@ def author_object(request: ObjectRequest, progress: StepProgress = silent) -> Au
 
 
 def _mesh(request: ObjectRequest) -> SoundMesh:
-    """Read the mesh in a child process: somebody else may have made it."""
+    """Read the mesh in a child process, because it may come from a third party."""
     arguments = request.mesh, request.scale, request.mass_kg is not None
     try:
         return limited.call(author_mesh.read, *arguments, seconds=_READING_S)
@@ -153,17 +157,18 @@ def _mesh(request: ObjectRequest) -> SoundMesh:
 def weigh(mesh: SoundMesh, parts: list[Part], mass_kg: float | None, density: float) -> Body:
     """Return mass, centre of mass and inertia at uniform density.
 
-    Those of the volume if the surface is closed, else those of the convex parts together. The
-    inertia about the centre of mass follows from the parallel-axis theorem.
+    Centre of mass and inertia are those of the enclosed volume if the surface is closed, otherwise
+    of the convex parts together (parallel-axis theorem). If no mass is given, it is the
+    density times the mesh's volume.
 
     Args:
         mesh: the mesh.
         parts: its convex parts.
-        mass_kg: its mass, or None.
+        mass_kg: its mass, None if unknown.
         density: kg/m3; used if no mass is given.
     """
     pieces = [mesh.trimesh()] if mesh.closed else [part.trimesh() for part in parts]
-    volumes = np.array([piece.volume for piece in pieces])  # m3, at density 1 kg/m3 also kg
+    volumes = np.array([piece.volume for piece in pieces])  # m3; also kg, at a density of 1 kg/m3
     centres = np.array([piece.center_mass for piece in pieces])
     com = volumes @ centres / volumes.sum()
     inertia = np.zeros((3, 3))
@@ -198,7 +203,7 @@ def _write(
     for title, shape in shapes.items():
         shape.apply_translation(-body.com)
         shape.export(raw / f"{title}.stl")
-        # As a solid, MuJoCo would refuse a thin or open surface.
+        # Not a solid, because MuJoCo refuses the inertia of a thin or open surface.
         kind = {"inertia": "shell"} if title == name else {}
         mjcf.add(section, "mesh", name=title, file=str(raw / f"{title}.stl"), **kind)
     mjcf.object_defaults(root)

@@ -1,7 +1,7 @@
 """The library source ``own``: the user's objects, hands and motions.
 
-It is in the user's folder, not in a cache, because it cannot be restored from elsewhere. Files are
-replaced as a whole and then entered in the manifest; readers only see what the manifest lists.
+It is in the user's folder (:func:`pgdm.paths.user`), not in a cache, because it cannot be fetched
+again. Files are replaced atomically, then entered in the manifest; readers see only what it lists.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def folder() -> Path:
 
 
 def read() -> Manifest:
-    """Return its manifest, empty if there is none yet.
+    """Return the manifest of the source, an empty one if the file does not exist yet.
 
     Raises:
         CorruptAssetError: the manifest is damaged.
@@ -48,7 +48,7 @@ def check_object_name(name: str, replace: bool) -> None:
     """Check that a new object may have this name.
 
     Raises:
-        ConfigError: the name is invalid, the library's, or taken and not to be replaced.
+        ConfigError: the name is invalid, used by the library, or by the user without ``replace``.
     """
     if not _OBJECT_NAME.fullmatch(name) or len(name) > _LONGEST:
         raise ConfigError(
@@ -76,7 +76,7 @@ def check_hand_name(name: str, shipped: Collection[str], replace: bool) -> None:
         replace: whether a hand of the user's may be replaced.
 
     Raises:
-        ConfigError: the name is invalid, the library's, or taken and not to be replaced.
+        ConfigError: the name is invalid, used by the library, or by the user without ``replace``.
     """
     if not _OBJECT_NAME.fullmatch(name) or len(name) > _LONGEST:
         raise ConfigError(
@@ -103,7 +103,7 @@ def check_task_name(task: str, shipped: Collection[str], replace: bool) -> None:
         replace: whether a task of the user's may be replaced.
 
     Raises:
-        ConfigError: the id is invalid, one of pgdm's, or taken.
+        ConfigError: the id is invalid, used by pgdm, or by the user without ``replace``.
     """
     if not _TASK_NAME.fullmatch(task) or len(task) > _LONGEST:
         raise ConfigError(
@@ -122,17 +122,17 @@ def check_task_name(task: str, shipped: Collection[str], replace: bool) -> None:
 def add_model(
     kind: str, name: str, make: Callable[[Path], list[str]], origin: str, licence: str
 ) -> Path:
-    """Add an object or a hand, or replace the one of that name.
+    """Add an object or a hand, or replace an existing one of that name.
 
     Args:
         kind: ``objects`` or ``hands``.
         name: its name.
-        make: writes it into a given empty folder and returns notes for the manifest.
-        origin: name of the file it was made from.
+        make: writes the model into the empty folder it is given; returns notes for the manifest.
+        origin: name of the file from which it was made.
         licence: its licence.
 
     Returns:
-        Its folder.
+        The model's folder.
 
     Raises:
         LibraryError: the user's folder cannot be written.
@@ -153,14 +153,14 @@ def add_model(
 def add_motion(
     task: str, entry: TaskEntry, arrays: Mapping[str, Any], notes: list[str], origin: str
 ) -> Path:
-    """Add a task's motion, or replace the one of that id.
+    """Add a task with its motion, or replace an existing task of that id.
 
     Args:
-        task: its id.
-        entry: its hand, objects, length and starts.
+        task: task id.
+        entry: the task's hand, objects, length and start states.
         arrays: from :func:`pgdm.library.files.motion.pack`.
         notes: notes for the manifest.
-        origin: name of the file it was derived from.
+        origin: name of the file from which the motion was derived.
 
     Returns:
         The motion's file.
@@ -181,15 +181,15 @@ def add_motion(
 
 
 def users_of(name: str) -> list[str]:
-    """Return the user's tasks with an object or a hand."""
+    """Return the user's tasks that use the object or hand of this name."""
     return [task for task, one in read().tasks.items() if name in (*one.objects, one.hand)]
 
 
 def check_unused(name: str) -> None:
-    """Check that no task of the user's has an object or a hand.
+    """Check that no task of the user's uses the object or hand of this name.
 
     Raises:
-        LibraryError: a task has it; names the task.
+        LibraryError: tasks use it; the message names them.
         UnknownNameError: the user has nothing of that name.
     """
     kind = kind_of(read(), name)
@@ -201,11 +201,11 @@ def check_unused(name: str) -> None:
 
 
 def remove(name: str) -> None:
-    """Remove an object, a hand or a task's motion of the user's.
+    """Remove the user's object, hand or task of this name, a task with its motion.
 
     Raises:
-        UnknownNameError: there is none of that name; names the existing ones.
-        LibraryError: it is an object or a hand that tasks still use.
+        UnknownNameError: the user has nothing of that name; the message lists what exists.
+        LibraryError: tasks still use the object or hand.
     """
     with staging.locked(folder()):
         own = read()
@@ -228,10 +228,10 @@ def remove(name: str) -> None:
 
 
 def kind_of(own: Manifest, name: str) -> str:
-    """Return what a name of the user's stands for: ``object``, ``hand`` or ``task``.
+    """Return what the user has under a name: ``object``, ``hand`` or ``task``.
 
     Raises:
-        UnknownNameError: for nothing; names what there is.
+        UnknownNameError: the user has nothing of that name; the message lists what exists.
     """
     names = {"task": list(own.tasks), "object": own.objects, "hand": own.hands}
     kind = next((kind for kind, known in names.items() if name in known), None)
@@ -242,11 +242,11 @@ def kind_of(own: Manifest, name: str) -> str:
 
 
 def facts(name: str, kind: str = "object") -> dict[str, Any]:
-    """Return what was recorded when an object or a hand of the user's was created.
+    """Return what was recorded when the user's object or hand was created.
 
     Raises:
         UnknownNameError: the user has no such object or hand.
-        LibraryError: its record is damaged.
+        LibraryError: the record is damaged.
     """
     check_name(f"{kind} of your own", name, getattr(read(), f"{kind}s"))
     path = folder() / f"{kind}s" / name / f"{kind}.json"

@@ -1,4 +1,4 @@
-"""Convex parts of a mesh, its collision geoms in the simulation."""
+"""Convex parts of a mesh, which become the object's collision geoms."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class PartsCfg:
     """How a mesh is decomposed into convex parts."""
 
     threshold: float = 0.05
-    """Remaining concavity, as a share of the size (0.01..1); lower gives more parts."""
+    """Largest remaining concavity, relative to the size (0.01..1); lower values give more parts."""
     max_parts: int | None = None
     """Largest number of parts; None: as many as the threshold requires."""
 
@@ -37,7 +37,7 @@ class PartsCfg:
         """Check the values.
 
         Raises:
-            ConfigError: one is out of range.
+            ConfigError: a value is out of range.
         """
         if not 0.01 <= self.threshold <= 1.0:
             raise ConfigError(f"--threshold is {self.threshold}; valid: 0.01 to 1")
@@ -55,23 +55,23 @@ class Part:
     """(F, 3) vertex numbers."""
 
     def trimesh(self) -> trimesh.Trimesh:
-        """Return it as trimesh's own class."""
+        """Return the part as a ``trimesh.Trimesh``."""
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
 def convex_parts(mesh: SoundMesh, cfg: PartsCfg, progress: StepProgress = silent) -> list[Part]:
     """Decompose a mesh into convex parts (CoACD), or return the cached result.
 
-    Equal input always gives equal parts.
+    Equal input always gives equal parts. A convex mesh is returned as a single part.
 
     Args:
         mesh: the mesh.
-        cfg: how finely it is decomposed.
+        cfg: how finely to decompose.
         progress: receives the seconds elapsed; the algorithm does not report its progress.
 
     Raises:
         ConfigError: a setting is out of range.
-        LibraryError: the decomposition failed, or gave no parts.
+        LibraryError: the decomposition failed, or gave no parts or too many.
     """
     cfg.check()
     cache = paths.home() / "parts" / f"{_key(mesh, cfg)}.npz"
@@ -127,7 +127,7 @@ def _decomposed(mesh: SoundMesh, cfg: PartsCfg) -> list[tuple[np.ndarray, np.nda
 def _in_background(
     work: Callable[[], list[tuple[np.ndarray, np.ndarray]]], progress: StepProgress
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Do the work in a separate thread, so that Ctrl-C stops the program immediately.
+    """Do the work in a separate thread, so that Ctrl-C can interrupt the program at once.
 
     Raises:
         LibraryError: the work failed.
@@ -156,11 +156,11 @@ def _in_background(
 
 
 def _sound(raw: list[tuple[np.ndarray, np.ndarray]]) -> list[Part]:
-    """Return the parts that have a volume, the largest first."""
+    """Return the hulls of the parts that have a volume, the largest first."""
     hulls = []
     for vertices, _ in raw:
         try:
-            # The hull again: rounding may have dented a decimated part.
+            # Take the hull: after decimation and rounding a part may be slightly concave.
             hulls.append(trimesh.convex.convex_hull(np.asarray(vertices, np.float64)))
         except (ValueError, RuntimeError, IndexError):  # Qhull: a sliver without a volume
             continue

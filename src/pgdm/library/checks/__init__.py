@@ -1,1 +1,1 @@
-"""Checks of models and motions, and comparisons between sources."""
+"""Checks of models and motions, and comparisons between library sources."""

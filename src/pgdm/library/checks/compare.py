@@ -40,13 +40,13 @@ class Difference:
     """One value that differs between two models."""
 
     element: str
-    """Its element, such as ``joint ARTx`` or ``geom wrist[2]``."""
+    """Element of the model, such as ``joint ARTx`` or ``geom wrist[2]`` (body and index)."""
     attribute: str
-    """Its name, such as ``range``; ``present`` if only one model has the element."""
+    """Attribute that differs, such as ``range``; ``present`` if only one model has the element."""
     first: str
-    """Its value in the first model."""
+    """Value in the first model."""
     second: str
-    """Its value in the second model."""
+    """Value in the second model."""
     physical: bool
     """False if it only changes how the model looks."""
 
@@ -87,7 +87,7 @@ def compare(
 
 
 def compare_options(first: mujoco.MjModel, second: mujoco.MjModel) -> list[Difference]:
-    """List the physics options that differ; only the scene has any, not the attached models."""
+    """List the physics options that differ; those of the scene apply, not an attached model's."""
     found = _Comparison(first, second, TOLERANCE)
     for name in _OPTIONS.split():
         found.value("option", name, getattr(first.opt, name), getattr(second.opt, name))

@@ -1,4 +1,4 @@
-"""Compiling models: as a check, and with reliable centres of mass."""
+"""Compiling models, with the same centre of mass of massless bodies as in earlier MuJoCo."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from pgdm.errors import CorruptAssetError
 
 
 def compile_tracked(spec: mujoco.MjSpec, body: str) -> mujoco.MjModel:
-    """Compile a model so that the centre of mass of a massless tracked body is its origin.
+    """Compile a model so that a massless tracked body has its centre of mass at its origin.
 
-    This applies if the file gives no inertial frame. MuJoCo up to 3.3 puts the centre of mass
-    there; 4.0 copies the body's pose in its parent into ``body_ipos`` and ``body_iquat``. The spec
-    is changed rather than the compiled model, because the bounding boxes of the body's geoms are
-    compiled in that frame.
+    This applies if the file gives no inertial frame. MuJoCo up to 3.3 puts the centre of mass at
+    the origin; 4.0 copies the body's pose in its parent into ``body_ipos`` and ``body_iquat``. The
+    spec is changed rather than the compiled model, because the compiler computes bounding boxes
+    of the body's geoms in the inertial frame.
 
     Args:
         spec: the model; a massless ``body`` gets an explicit inertial frame.
-        body: name of the tracked body, which may be missing. Other bodies remain as MuJoCo compiles
-            them.
+        body: name of the body that the task tracks, which may be missing. Other bodies remain as
+            MuJoCo compiles them.
 
     Raises:
         ValueError: MuJoCo cannot compile the model.
@@ -38,7 +38,7 @@ def compile_tracked(spec: mujoco.MjSpec, body: str) -> mujoco.MjModel:
 
 
 def counts(path: Path, label: str) -> tuple[int, int]:
-    """Return the numbers of joint coordinates and of actuators of a model; see ``compiled``."""
+    """Return nq and nu of a model, compiled with :func:`compiled`."""
     model = compiled(path, label)
     return model.nq, model.nu
 
@@ -46,7 +46,7 @@ def counts(path: Path, label: str) -> tuple[int, int]:
 def compiled(
     path: Path, label: str, edit: Callable[[mujoco.MjSpec], object] | None = None
 ) -> mujoco.MjModel:
-    """Compile a library model, an object with the centre of mass of :func:`compile_tracked`.
+    """Compile a library model with :func:`compile_tracked`, whose tracked body is ``object``.
 
     Args:
         path: its MJCF file.
@@ -54,7 +54,7 @@ def compiled(
         edit: changes the spec before it is compiled.
 
     Raises:
-        CorruptAssetError: MuJoCo cannot compile it; the message has its reason.
+        CorruptAssetError: MuJoCo cannot compile the model; the message has MuJoCo's reason.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(path))

@@ -1,4 +1,4 @@
-"""Provenance of a task of the library, and differences between its two sources."""
+"""Provenance of a task of the library, and its differences between two library sources."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pgdm.library.files.expert import FINGERS
 from pgdm.library.tasks import MOCAP_TASKS
 
 _MOTION_TOLERANCE = 1e-9
-"""Largest difference (m, rad) of poses and joint positions that count as equal."""
+"""Largest difference that counts as equal: positions and joints (m, rad), quaternion components."""
 
 
 def explain(library: Library, task: str) -> Iterator[str]:
@@ -30,7 +30,7 @@ def explain(library: Library, task: str) -> Iterator[str]:
     having = [s for s in manifests if task in manifests[s].tasks]
     for source in having:
         manifest = manifests[source]
-        mark = "serves the task" if source == serving else "also there"
+        mark = "serves the task" if source == serving else "also has it"
         yield f"\nsource {source} ({mark}): {manifest.origin}, {manifest.imported_at}"
         starts = library.entry(task, source).starts
         yield f"  starts: {', '.join(starts)}"
@@ -70,24 +70,24 @@ def explain_expert(library: Library, task: str) -> Iterator[str]:
     yield f"  poses: {entry.steps}, after {entry.skipped} frames of the recording"
     moved = ", ".join(f"{1e3 * x:.1f}" for x in entry.shift_m)
     yield (
-        f"  its object is off the motion's by {1e3 * entry.object_mean_m:.3f} mm (mean), "
+        f"  its object deviates from the motion's by {1e3 * entry.object_mean_m:.3f} mm (mean), "
         f"{1e3 * entry.object_max_m:.3f} mm (max)"
         + (f", after a shift by ({moved}) mm" if any(entry.shift_m) else "")
     )
     yield (
         f"  exceeds joint limits by up to {entry.beyond_limits_rad:.2f} rad and, at the base, "
-        f"{entry.beyond_limits_m:.2f} m (clipped for methods)"
+        f"{entry.beyond_limits_m:.2f} m (methods clip it)"
     )
     if entry.approximate:
-        yield f"  of {entry.steps} poses (the recording has no contact flag), by finger:"
+        yield f"  over all {entry.steps} poses (the recording has no contact flag), by finger:"
     else:
-        yield f"  the hand touches the object at {entry.touching_frames} poses, of which by finger:"
+        yield f"  the hand touches the object at {entry.touching_frames} poses; by finger:"
     rows = zip(FINGERS, entry.contact_frames, entry.within_5mm, strict=True)
     yield "  " + "; ".join(f"{name} in contact {n}, within 5 mm {p:.0%}" for name, n, p in rows)
 
 
 def needed(library: Library, task: str, source: str) -> list[str]:
-    """Return the files of a task, relative to the source's folder."""
+    """Return a source's files of a task, relative to the source's folder."""
     entry = library.entry(task, source)
     every = [
         "scene/table.xml",
@@ -95,12 +95,12 @@ def needed(library: Library, task: str, source: str) -> list[str]:
         *(f"objects/{name}/object.xml" for name in entry.objects),
         f"motions/{task}.npz",
     ]
-    # A library source without hands of its own takes the rest from another one.
+    # Models that the source lacks come from another library source.
     return [name for name in every if name in library.sources()[source].files]
 
 
 def differences(library: Library, task: str, first: str, second: str) -> Iterator[str]:
-    """Yield the differences of a task between two sources: compiled models, motion, starts.
+    """Yield lines about a task's differences between two sources: models, motion, starts.
 
     Sites, cameras, lights and materials do not affect the physics and are ignored.
 
@@ -125,7 +125,7 @@ def _lines(found: list[Difference]) -> Iterator[str]:
 
 
 def motion_differences(library: Library, task: str, first: str, second: str) -> Iterator[str]:
-    """Yield the differences of a task's motion and starts between two sources."""
+    """Yield lines about the differences of a task's motion and starts between two sources."""
     one, two = library.motion(task, first), library.motion(task, second)
     if len(one.translation) != len(two.translation):
         yield f"motion: {len(one.translation)} against {len(two.translation)} steps"

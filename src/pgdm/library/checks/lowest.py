@@ -12,7 +12,7 @@ def lowest(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float:
     Args:
         model: the scene.
         data: its state; kinematics are updated.
-        body: id of the body; without collision geoms its origin counts.
+        body: id of the body; if it has no collision geoms, the height of its origin is returned.
     """
     mujoco.mj_kinematics(model, data)
     solid = (model.geom_contype | model.geom_conaffinity) != 0

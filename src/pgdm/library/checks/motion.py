@@ -1,4 +1,4 @@
-"""Whether a hand could carry an object along a motion, and corrections that make it possible."""
+"""Checks that a hand could carry an object along a motion, and corrections of the motion."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from pgdm.library.files.keyframes import continuous
 from pgdm.library.files.poses import resampled
 from pgdm.library.tasks import STEP_S
 
-# The fastest of the benchmark's 50 motions have 2.2 m/s, 44 m/s2 (a bottle is shaken) and
-# 16 rad/s, about what the hands' servos can follow.
+# The benchmark's 50 motions reach 2.2 m/s, 44 m/s2 (a bottle is shaken) and 16 rad/s, about the
+# most that the hands' servos can follow.
 MAX_SPEED_M_S, MAX_ACCELERATION_M_S2, MAX_TURN_RAD_S = 2.5, 50.0, 20.0
 STEPS = (10, 500)
-"""Least and largest number of poses of a motion: 0.4 s to 20 s."""
+"""Smallest and largest number of poses of a motion: 0.4 s to 20 s."""
 START_SPEED_M_S, START_TURN_RAD_S = 0.1, 1.0
-"""Largest speeds in the first step; recorded motions are cut where the object starts to move."""
+"""Largest accepted speeds in the first step, as a motion must start at rest."""
 SUNK_M = 0.003
-"""Largest depth of the object in the table."""
-_JUMP = 4.0  # times the speed of the neighbouring steps: a discontinuity rather than a fast motion
-_SMOOTH_STEPS, _EASE_STEPS = 2.0, 8  # sigma of the filter, and poses at rest added at either end
-_LIFT_STEPS = 6  # poses before and after a raised pose that are raised with it
+"""Largest accepted depth of the object's lowest point below the table top."""
+_JUMP = 4.0  # a step this many times as fast as its neighbours is a discontinuity
+_SMOOTH_STEPS, _EASE_STEPS = 2.0, 8  # filter's sigma, poses added at each end
+_LIFT_STEPS = 6  # number of poses raised before and after a pose that is too low
 
 
 @dataclass(frozen=True)
 class Poses:
-    """A motion of the object's centre of mass."""
+    """A motion of an object; positions are those of its centre of mass."""
 
     pos: np.ndarray  # (T, 3) m, world frame
-    quat: np.ndarray  # (T, 4) wxyz
+    quat: np.ndarray  # (T, 4) wxyz, orientation of the object
 
 
 def speeds(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
@@ -45,16 +45,16 @@ def speeds(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_motion(poses: Poses, label: str) -> None:
-    """Check length, jumps, speeds, and that the object starts at rest.
+    """Check length, jumps, speeds, accelerations, and that the object starts at rest.
 
     Raises:
-        ConfigError: no hand can follow the motion; names the row and the option that helps.
+        ConfigError: a check fails; the message names the row and the option that helps.
     """
     steps = len(poses.pos)
     if not STEPS[0] <= steps <= STEPS[1]:
         raise ConfigError(
             f"{label}: {steps} poses ({steps * STEP_S:.1f} s); valid: {STEPS[0]} to {STEPS[1]}, "
-            f"one each {STEP_S:g} s"
+            f"one every {STEP_S:g} s"
         )
     fast, turning = speeds(poses)
     for values, limit, unit, verb in (
@@ -70,20 +70,20 @@ def check_motion(poses: Poses, label: str) -> None:
                     "around it are small; repair the recording there"
                 )
             raise ConfigError(
-                f"{label}: {verb} at {values[row]:.3g} {unit} in row {row + 1}, a hand follows "
+                f"{label}: {verb} at {values[row]:.3g} {unit} in row {row + 1}, a hand can follow "
                 f"{limit:g} at most; slow it down (--slower FACTOR)"
             )
     push = np.linalg.norm(np.diff(poses.pos, 2, axis=0), axis=1) / STEP_S**2
     row = int(push.argmax())
     if push[row] > MAX_ACCELERATION_M_S2:
         raise ConfigError(
-            f"{label}: accelerates by {push[row]:.3g} m/s2 in row {row + 1}, a hand follows "
+            f"{label}: accelerates at {push[row]:.3g} m/s2 in row {row + 1}, a hand can follow "
             f"{MAX_ACCELERATION_M_S2:g} at most; --smooth or --slower FACTOR help"
         )
     if fast[0] > START_SPEED_M_S or turning[0] > START_TURN_RAD_S:
         raise ConfigError(
             f"{label}: already moves in its first step, {fast[0]:.2g} m/s and "
-            f"{turning[0]:.2g} rad/s; a motion starts at rest: --smooth adds a start-up"
+            f"{turning[0]:.2g} rad/s; a motion must start at rest; --smooth adds a gradual start"
         )
 
 
@@ -102,7 +102,7 @@ def smoothed(poses: Poses) -> Poses:
 
 
 def slower(poses: Poses, factor: float) -> Poses:
-    """Return the motion slowed down by a factor.
+    """Return the motion slowed down by a factor from 1 to 20.
 
     Raises:
         ConfigError: the factor is out of range.
@@ -115,11 +115,11 @@ def slower(poses: Poses, factor: float) -> Poses:
 
 
 class TableCheck:
-    """Measures how deep an object is in the table along a motion.
+    """Measures how far an object sinks below the table top (z = 0) along a motion.
 
     Args:
         model: a scene with the object.
-        body: id of its body, whose six joints are the last in qpos.
+        body: id of the object's body, whose six joints are the last in qpos.
     """
 
     def __init__(self, model: mujoco.MjModel, body: int) -> None:
@@ -127,7 +127,7 @@ class TableCheck:
         self._data = mujoco.MjData(model)
 
     def depths(self, poses: Poses) -> np.ndarray:
-        """Return how deep the object is in the table at each pose, (T,) m, 0 if not at all."""
+        """Return how far the object sinks below the table top at each pose, (T,) m, at least 0."""
         joints = object_joints(self._model, self._body, poses)
         depths = np.zeros(len(joints))
         for i, qpos in enumerate(joints):
@@ -136,10 +136,10 @@ class TableCheck:
         return depths
 
     def check(self, poses: Poses, label: str) -> None:
-        """Check that the object is never in the table.
+        """Check that the object never sinks below the table top by more than `SUNK_M`.
 
         Raises:
-            ConfigError: it is at a pose; names the deepest.
+            ConfigError: it does; the message names the row of greatest depth.
         """
         depths = self.depths(poses)
         row = int(depths.argmax())
@@ -151,7 +151,7 @@ class TableCheck:
             )
 
     def lifted(self, poses: Poses) -> Poses:
-        """Return the motion raised, smoothly, where it is in the table."""
+        """Return the motion, raised smoothly where the object sinks below the table top."""
         depths = self.depths(poses)
         around = maximum_filter1d(depths, 2 * _LIFT_STEPS + 1, mode="nearest")
         raised = np.maximum(gaussian_filter1d(around, _LIFT_STEPS / 3, mode="nearest"), depths)
@@ -163,7 +163,7 @@ def object_joints(model: mujoco.MjModel, body: int, poses: Poses) -> np.ndarray:
 
     Args:
         model: a scene.
-        body: id of the object's body: three slides, then three hinges, intrinsic X-Y-Z.
+        body: id of the object's body, which has three slides, then three hinges (intrinsic X-Y-Z).
         poses: the motion.
     """
     base = Rotation.from_quat(model.body_quat[body], scalar_first=True)

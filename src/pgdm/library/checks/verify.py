@@ -1,4 +1,4 @@
-"""Checking that the library's files are unchanged since it was filled."""
+"""Checking that the library's files have not changed since the library was filled."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def damaged(library: Library, progress: StepProgress = silent) -> list[str]:
         progress: receives the number of files.
 
     Returns:
-        One line per file, empty if all are intact.
+        A line per damaged file; empty if all files are intact.
     """
     left_out = set(present(library.root)) - set(library.sources())
     found = [f"{source}/manifest.json: damaged" for source in sorted(left_out)]
@@ -26,5 +26,5 @@ def damaged(library: Library, progress: StepProgress = silent) -> list[str]:
         elif path.stat().st_size != entry.bytes:
             found.append(f"{name}: {path.stat().st_size} bytes instead of {entry.bytes}")
         elif sha256_of(path) != entry.sha256:
-            found.append(f"{name}: content changed, its SHA-256 is not the recorded one")
+            found.append(f"{name}: content changed, its SHA-256 differs from the recorded one")
     return found

@@ -1,1 +1,1 @@
-"""Expert hand trajectories: read, rebuilt where unpublished, and indexed."""
+"""Expert hand trajectories: rebuilding unpublished ones, measuring, and filling the library."""

@@ -2,7 +2,7 @@
 
 The recordings have the joint locations of a hand but not its fingertips: a finger's last bone is
 assumed to start at its DIP joint, in the direction of the bone before it. Its length, the radii and
-the distance that counts as contact are our choice; docs/assets.md has the results.
+the contact distance are our choice; docs/assets.md has the results.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ RADII_M = np.array([0.008, 0.008, 0.007, 0.008, 0.009])
 """Radius of each finger's last bone."""
 
 CONTACT_M = 0.008
-"""A finger closer than this is in contact, if the recording has the hand in contact."""
+"""A finger closer than this is in contact, if the recording flags the hand as in contact."""
 
 CLOSE_M = 0.005
-"""Distance for the reported share of poses with a close finger."""
+"""Distance threshold of the reported share of poses at which a finger is close."""
 
 _THIN_M = 1e-6
-"""Radius of the capsule that is measured from: almost the bone's axis, so that the closest point is
-well defined where the finger overlaps the object."""
-_FAR_M = 10.0
+"""Radius of the capsule from which distances are measured: almost zero, so that the closest point
+is well defined where the finger overlaps the object."""
+_FAR_M = 10.0  # larger distances are not measured
 _BODY = 1  # an object is one body, child of the world
 
 
@@ -43,15 +43,15 @@ class Contacts:
     points: np.ndarray
     """Closest points of the object (T, 5, 3) m, in the frame of its body."""
     distances: np.ndarray
-    """Distances of the fingers' surface from the object (T, 5) m, negative where they overlap."""
+    """Distances of the fingers' surfaces from the object (T, 5) m, negative where they overlap."""
 
     def in_contact(self, touching: np.ndarray) -> np.ndarray:
-        """Return whether each finger is in contact (T, 5), given whether the hand is (T,), bool."""
+        """Return whether each finger is in contact (T, 5), given the hand's contact flags (T,)."""
         return (self.distances < CONTACT_M) & touching[:, None]
 
 
 def bones(human_joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return start (T, 5, 3) m and direction (unit vectors) of the fingers' last bones.
+    """Return start (T, 5, 3) m and unit direction (T, 5, 3) of the fingers' last bones.
 
     Args:
         human_joints: joint locations (T, 16, 3) m, MANO order: a finger's second joint is PIP, its
@@ -102,7 +102,7 @@ def measure(
 
 
 def _with_capsule(xml: Path) -> tuple[mujoco.MjModel, int, list[int]]:
-    """Compile the object with a capsule to measure from; return the ids of capsule and parts."""
+    """Compile the object with a capsule; return the model and the geom ids of capsule and parts."""
     capsule, size = mujoco.mjtGeom.mjGEOM_CAPSULE, [_THIN_M, 0.5 * BONE_M, 0.0]
     model = compiled(
         xml,

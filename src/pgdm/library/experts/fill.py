@@ -1,7 +1,7 @@
 """Filling the library's folder of expert hand trajectories.
 
-They belong to no library source: the motions, hands and objects used in their measurements are the
-same in both.
+They belong to no library source: the motions, hands and objects used to measure them are the same
+in ``checkout`` and ``registry``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LICENCE = "Apache-2.0, derived from GRAB (non-commercial research)"
 """Licence of every expert trajectory."""
 
 _REBUILT_CURE = "'pgdm assets fetch --experts' rebuilds it from another package"
-"""Note on a task whose published trajectory is empty."""
+"""Advice about a task whose published trajectory is empty."""
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class _Builder:
         self.left_out: dict[str, str] = {}
 
     def add(self, task: str, recording: Recording, package: Package, origin: str) -> None:
-        """Measure and write one task's trajectory."""
+        """Write one task's trajectory and measure its quality."""
         motion = self._library.motion(task)
         qpos = self._hand.shifted(recording.qpos, recording.shift)
         human = recording.human_joints + recording.shift
@@ -91,7 +91,7 @@ class _Builder:
         self.left_out.pop(task, None)
 
     def keep(self, task: str, entry: ExpertEntry) -> None:
-        """Keep a trajectory of the library if it is intact and fits the motion."""
+        """Keep a trajectory already in the library if it is intact and fits the motion."""
         present = staging.folder_of(self._library.root, staging.EXPERTS)
         assert present is not None
         file = present / f"{task}.npz"
@@ -107,7 +107,7 @@ class _Builder:
         self.left_out[task] = reason
 
     def finish(self) -> ExpertIndex:
-        """Write the index."""
+        """Write the index and return it."""
         experts = dict(sorted(self.experts.items()))
         index = ExpertIndex(manifest.now(), experts, self.left_out)
         expert_index.write(self._folder, index)
@@ -121,15 +121,15 @@ def fill(
     progress: StepProgress = silent,
     recordings: Path | None = None,
 ) -> ExpertIndex:
-    """Fill the folder, for a caller who holds the library's lock.
+    """Fill the folder; the caller must hold the library's lock.
 
-    A recording that is damaged or does not fit its motion is left out, with the reason. Tasks whose
-    motion the library lacks are skipped: it may be added later.
+    A recording that is damaged or does not fit its motion is left out and the reason recorded.
+    Tasks whose motion the library lacks are skipped.
 
     Args:
         root: the library, with the motions.
         package: the package with the published trajectories.
-        archive: its wheel.
+        archive: wheel of that package.
         progress: receives the number of files.
         recordings: wheel of the package from which unpublished trajectories are rebuilt; None keeps
             those rebuilt before.

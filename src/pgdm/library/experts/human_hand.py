@@ -1,6 +1,6 @@
-"""Joint locations of one hand from points of another that made the same motion.
+"""Computing a human hand's joint locations from points of another hand that made the same motion.
 
-All arrays have N frames, in m, in the world frame unless stated otherwise.
+Arrays cover N frames; positions are in m, in the world frame unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ import numpy as np
 from pgdm.library.files.expert import HUMAN_JOINTS
 
 LAG_FRAMES = 0.5
-"""Lag of MyoHand's recordings behind the motion capture, frames, as the hand was pulled along."""
+"""Frames by which MyoHand, a musculoskeletal hand model, lags behind the human hand pulling it."""
 
 RIDGE = 0.01
-"""Penalty of the regression, per sample and standardised feature."""
+"""Ridge penalty per sample, for standardised features."""
 
 _STILL_M = 1e-5
-"""Coordinates that vary by less are ignored: the knuckles are fixed in the palm."""
+"""Coordinates with a smaller standard deviation are ignored, such as those of the knuckles, which
+are fixed in the palm."""
 
 
 def matrices(quaternions: np.ndarray) -> np.ndarray:
@@ -33,7 +34,7 @@ def matrices(quaternions: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotations (..., 3, 3) nearest to given matrices (orthogonal Procrustes)."""
+    """Return the rotations nearest to matrices (..., 3, 3) (orthogonal Procrustes)."""
     u, _, vt = np.linalg.svd(matrix)
     signs = np.ones(matrix.shape[:-1])
     signs[..., 2] = np.linalg.det(u @ vt)
@@ -62,9 +63,9 @@ def rigid(
 
 
 def later(values: np.ndarray, frames: float) -> np.ndarray:
-    """Return values (N, ...) at times later by 0 to 1 frames, linearly interpolated.
+    """Return values (N, ...) linearly interpolated at times later by ``frames``, 0 to 1.
 
-    The last row is extrapolated from the one before it.
+    The last row is extrapolated from the last two.
     """
     step = np.diff(values, axis=0)
     return values + frames * np.concatenate((step, step[-1:]))
@@ -72,18 +73,18 @@ def later(values: np.ndarray, frames: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PalmView:
-    """A hand in the frame of its palm, N frames."""
+    """A hand's points in the frame of its palm, over N frames."""
 
     origin: np.ndarray = field(repr=False)
     """Origin of the palm (N, 3) m, world frame."""
     rotation: np.ndarray = field(repr=False)
     """Orientation of the palm (N, 3, 3)."""
     features: np.ndarray = field(repr=False)
-    """Coordinates of the other points in the palm's frame (N, 3 (P-1)), m."""
+    """Coordinates of the P-1 points other than the origin, in the palm's frame (N, 3 (P-1)), m."""
 
     @classmethod
     def of(cls, points: np.ndarray, palm: np.ndarray) -> PalmView:
-        """Return the view of points (N, P, 3) m; the first is the palm's origin."""
+        """Return the view of points (N, P, 3) m, the palm's origin first; ``palm`` is (N, 3, 3)."""
         origin = points[:, 0]
         local = np.einsum("nji,npj->npi", palm, points[:, 1:] - origin[:, None])
         return cls(origin, palm, local.reshape(len(points), -1))
@@ -131,6 +132,6 @@ class Ridge:
 
 
 def human_joints(view: PalmView, ridge: Ridge) -> np.ndarray:
-    """Return the human hand's joint locations (N, 16, 3) m, MANO order, from a view of another."""
+    """Return the human hand's joints (N, 16, 3) m, MANO order, predicted from another hand."""
     joints = view.placed(ridge(view.features))
     return joints.reshape(len(joints), HUMAN_JOINTS, 3)

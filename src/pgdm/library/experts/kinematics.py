@@ -13,13 +13,13 @@ from pgdm.library.files.expert import FINGERTIPS, JOINTS
 
 
 class ExpertHand:
-    """Adroit alone, at its pose in the world frame of the tasks.
+    """Adroit without table and object, mounted in the world frame as in the tasks.
 
     Args:
-        xml: the library's model of it.
+        xml: MJCF of Adroit in the library.
 
     Raises:
-        CorruptAssetError: it does not compile, or is not Adroit.
+        CorruptAssetError: the model does not compile, or is not Adroit.
     """
 
     def __init__(self, xml: Path) -> None:
@@ -33,14 +33,14 @@ class ExpertHand:
         self._tips = [names[tip] for tip in FINGERTIPS]
         self._slides = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
         mujoco.mj_kinematics(model, self._data)
-        self._axes = self._data.xaxis[self._slides].copy()  # (3, 3) one per row, world frame
+        self._axes = self._data.xaxis[self._slides].copy()  # (3, 3), an axis per row, world frame
 
     def clipped(self, qpos: np.ndarray) -> np.ndarray:
         """Return joint positions (..., 30) clipped to their limits."""
         return qpos.clip(*self._model.jnt_range.T)
 
     def beyond_limits(self, qpos: np.ndarray) -> tuple[float, float]:
-        """Return the largest excess over limits of qpos (T, 30): slides [m], hinges [rad]."""
+        """Return the largest excess of qpos (T, 30) over its limits: slides [m], hinges [rad]."""
         excess = np.abs(qpos - self.clipped(qpos)).max(axis=0)
         return float(excess[self._slides].max()), float(excess[~self._slides].max())
 

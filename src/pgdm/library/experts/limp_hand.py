@@ -1,7 +1,7 @@
-"""Joint positions of a robot hand that is pulled along by the joint locations of a human hand.
+"""Retargeting by simulation: a human hand's joint locations pull an unactuated robot hand along.
 
 This is how the published trajectories were made: each point of a robot hand without motors is tied
-to a point of a human hand whose bones are scaled to the robot's lengths. With the object in the
+to a joint of a human hand whose bones are scaled to the robot's lengths. With the object in the
 scene this reproduces the published finger joints to 0.06 rad (RMS), with a mean fingertip error of
 1.8 mm (`benchmark/retarget.py`).
 """
@@ -23,7 +23,7 @@ class PulledHand:
     """The points by which a robot hand is pulled."""
 
     points: tuple[str, ...]
-    """Bodies (P,) at the hand's points, in the order of the human hand's joints."""
+    """Names of the bodies (P,) at the points, in the order of the human hand's joints."""
     parents: tuple[int, ...]
     """Index of each joint's parent in the tree rooted at the wrist; the wrist is its own parent."""
     wrist_anchor_m: tuple[float, float, float]
@@ -41,10 +41,10 @@ ADROIT = PulledHand(
     ),
     parents=(0, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14),
     # Measured: in the published trajectories Adroit's first wrist joint is at the human wrist, but
-    # bone lengths are measured from the body `wrist_point`, 34 mm further.
+    # bone lengths are measured from the body `wrist_point`, 34 mm away from that joint.
     wrist_anchor_m=(0.0, 0.0, -0.034),
 )
-"""Adroit, as in the published trajectories."""
+"""Adroit's points, as in the simulation behind the published trajectories."""
 
 TIMESTEP_S = 0.004
 STEPS = 10
@@ -53,15 +53,15 @@ SETTLING_STEPS = 2000
 """Physics steps on the first frame before the motion begins."""
 
 _PULL_DELAY = 1
-"""Physics steps of a frame before its targets apply. The simulation behind the published
-trajectories computed its forces at the end of a step. Without this delay the mean fingertip error
-is 2.4 mm, with it 1.8 mm."""
+"""Number of physics steps in a frame before its targets apply, since the simulation behind the
+published trajectories computed its forces at the end of a step. Without this delay the mean
+fingertip error is 2.4 mm, with it 1.8 mm."""
 
 _HAND, _OBJECT, _PULL = "hand/", "object/", "pull"
 
 
 def bone_scaled(points: np.ndarray, lengths: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
-    """Return a hand with other bone lengths, the bones in the same directions.
+    """Return a hand's joint locations with new bone lengths and unchanged bone directions.
 
     Args:
         points: joint locations (N, P, 3) m.
@@ -82,13 +82,13 @@ def bone_scaled(points: np.ndarray, lengths: np.ndarray, parents: tuple[int, ...
 
 
 class LimpHand:
-    """An unactuated robot hand above the table, with an object that is put at prescribed poses.
+    """An unactuated robot hand above the table, with an object placed at prescribed poses.
 
     Args:
         table: MJCF of the scene.
         hand: MJCF of the hand.
         object_xml: MJCF of the object.
-        pulled: the hand's points.
+        pulled: the points by which the hand is pulled.
 
     Raises:
         CorruptAssetError: a model does not compile or lacks a point.
@@ -110,14 +110,14 @@ class LimpHand:
         bodies = [self._model.body(i).name for i in self._model.jnt_bodyid]
         self._num_joints = sum(name.startswith(_HAND) for name in bodies)
         self.lengths = self._bone_lengths()
-        """Lengths of the robot's bones (P,) m, measured with the hand straight."""
+        """Lengths of the robot's bones (P,) m, measured at joint positions of zero."""
 
     def track(
         self, human_joints: np.ndarray, position: np.ndarray, rotation: np.ndarray
     ) -> np.ndarray:
         """Return the robot's joint positions (N, J), m and rad, one row per frame.
 
-        At the start of each frame the object is put at the pose of the previous frame; it then
+        At the start of each frame the object is placed at the pose of the previous frame; it then
         moves freely until the next frame, as in the simulation behind the published trajectories.
         Joints may exceed their limits, as the pull is stronger than the limit constraints.
 

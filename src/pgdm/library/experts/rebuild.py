@@ -1,10 +1,10 @@
-"""Unpublished expert hand trajectories, rebuilt from recordings of another hand.
+"""Rebuilding unpublished expert hand trajectories from recordings of another hand.
 
 Other recordings of the same motions exist with MyoHand (a musculoskeletal hand model). A regression
-on the motions that were recorded both with it and with a human hand maps MyoHand's points to the
+on the motions recorded both with MyoHand and with a human hand maps MyoHand's points to the
 joint locations of the human hand, which then pull an unactuated model of the Adroit robot hand
 along. `benchmark/retarget.py` leaves out one published trajectory at a time and measures the error
-of the rebuilt one.
+of its rebuilt version.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from pgdm.library.robohive.myohand import HandMotion, MyoHand
 from pgdm.library.tasks import objects_of
 
 CORRECTION_M = {"wineglass": np.array([-0.004, -0.023, 0.063])}
-"""Correction added to MyoHand's points, by object, where its recordings have the hand displaced:
-the mean over five recordings, each of which is within 7 mm of that mean."""
+"""Correction added to MyoHand's points (world frame), for objects in whose recordings the hand is
+displaced: the mean over five recordings, each of which is within 7 mm of that mean."""
 
 _NEAR_M = 0.001
-"""Largest accepted distance of a recording's object from the motion's. For the four tasks whose
-published trajectory is empty, the measured distance is zero up to rounding (below 1e-12 mm)."""
+"""Largest accepted distance of a recording's object from the motion's. For the four tasks to be
+rebuilt, the measured distance is zero up to rounding (below 1e-12 mm)."""
 
 _WANTED = re.compile(rf"{FOLDER}/Adroit_[a-z]+_[a-z0-9_]+\.npz")
 
@@ -59,11 +59,11 @@ class _Pair:
 class Rebuilder:
     """Fits a regression on all motions recorded with both hands, and rebuilds trajectories with it.
 
-    Deterministic for given packages on one type of machine.
+    The result depends only on the packages and the type of machine.
 
     Args:
-        library: contains the motions, and the models of hand and objects.
-        folder: the packages' files, from :func:`unpacked`.
+        library: contains the motions and the models of table, hand and objects.
+        folder: folder of the packages' files, from :func:`unpacked`.
         progress: receives the number of recordings.
 
     Raises:
@@ -81,7 +81,7 @@ class Rebuilder:
                 self._pairs[task] = self._pair(task, path)
 
     def tasks(self) -> list[str]:
-        """Return the tasks used in the fit."""
+        """Return the ids of the tasks used in the fit."""
         return list(self._pairs)
 
     def rebuild(self, task: str) -> Recording:
@@ -146,7 +146,7 @@ class Rebuilder:
     ) -> np.ndarray:
         """Return joint positions of Adroit (N, 30), m and rad, that follow a human hand.
 
-        The task's object is in the scene.
+        The simulation includes the task's object.
 
         Args:
             task: task id.
@@ -160,8 +160,8 @@ class Rebuilder:
             self._library.scene_xml(source), self._library.hand_xml(HAND, source), object_xml
         )
         # The published simulation took the motion's positions as the object's centre of mass and
-        # subtracted the unrotated offset. We repeat this, so that the fingers meet the object where
-        # they did then.
+        # subtracted the unrotated offset of the centre of mass from the body's origin. We do the
+        # same, so that the fingers meet the object at the same place.
         offset = compiled(object_xml, task).body_ipos[1]
         return limp.track(human, position - offset, rotation)
 
@@ -187,7 +187,7 @@ class Rebuilder:
 
 
 def _view(recorded: HandMotion, frame_rotation: np.ndarray, task: str) -> PalmView:
-    """Return the hand in the world frame of the published recordings.
+    """Return MyoHand's points and palm, rotated to the world frame of the published recordings.
 
     MyoHand's lag behind the motion capture (`human_hand.LAG_FRAMES`) is compensated. Only the
     rotation between the world frames applies: the translation stems from the scenes' different
@@ -200,7 +200,7 @@ def _view(recorded: HandMotion, frame_rotation: np.ndarray, task: str) -> PalmVi
 
 
 def _rotated(rotation: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
-    """Return orientations (N, 4) wxyz after a further rotation (3, 3)."""
+    """Return orientations (N, 4) wxyz, rotated by a matrix (3, 3) in the world frame."""
     further, result = np.empty(4), np.empty_like(quaternions)
     mujoco.mju_mat2Quat(further, rotation.ravel())
     for row, quaternion in zip(result, quaternions, strict=True):

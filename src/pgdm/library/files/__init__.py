@@ -1,1 +1,1 @@
-"""The files the library reads and writes, none of which may run code."""
+"""Reading and writing the library's files; reading never runs code from them."""

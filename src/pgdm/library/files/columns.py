@@ -1,4 +1,4 @@
-"""Tables of poses: which column is which number, and the order of a quaternion's numbers."""
+"""Tables of poses: the meaning of each column, and the order of a quaternion's components."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _PLACE = r"(?:(?:\w+[./])*(?:p|pos|position|t|trans|translation)[._ ]?)?([xyz])(?:_m| ?\[m\])?"
 _TURN = r"(?:\w+[./])*(?:q|quat|quaternion|r|rot|rotation|orientation)[._ ]?([wxyz])"
 _TIME = r"t|t_s|time|time_s|timestamp|sec|secs|seconds|time ?\[s\]"
-# A start that makes sense only in the other order: upright there, or as modelled.
+# Thresholds of check_order: tilt of the vertical, and angle of the rotation from the rest pose.
 _LEVEL_RAD, _UPRIGHT_RAD, _TILTED_RAD = np.deg2rad([3.0, 10.0, 20.0])
 _NEAR_RAD, _FAR_RAD = np.deg2rad([60.0, 120.0])
 
 
 @dataclass(frozen=True)
 class Table:
-    """Poses as a file has them."""
+    """Poses as stored in a file."""
 
     rows: np.ndarray = field(repr=False)
     """(N, 7) in the order of `POSE`, unchecked."""
     times: np.ndarray | None = field(repr=False)
-    """(N,) s, if the file has them."""
+    """(N,) s, None if the file has no times."""
     named: bool
-    """Whether the file says which column is which."""
+    """Whether the file names its columns."""
     notes: list[str]
     """What was assumed or left out, one sentence each."""
 
 
 def known(names: Sequence[str]) -> bool:
-    """Return whether any of the names is that of a column of poses."""
+    """Return whether any of the names is a known name of a pose or time column."""
     return any(_meaning(name) for name in names)
 
 
@@ -46,11 +46,11 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
 
     Args:
         rows: (N, C).
-        names: names of the columns, (C,), such as ``qx``, ``quat_x`` or ``pose.orientation.x``.
+        names: names of the C columns, such as ``qx``, ``quat_x`` or ``pose.orientation.x``.
         label: the file's name in messages.
 
     Raises:
-        CorruptAssetError: a column is missing, or there are two of a kind.
+        CorruptAssetError: a column is missing, or two columns have the same meaning.
     """
     if rows.ndim != 2 or rows.shape[1] != len(names):
         raise CorruptAssetError(
@@ -70,7 +70,7 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
 
 
 def by_place(rows: np.ndarray, times: np.ndarray | None = None) -> Table:
-    """Return the poses of a table without names: `POSE`, with the time before them if 8 wide."""
+    """Return the poses of a table without column names: `POSE`, after the time if 8 columns."""
     if rows.ndim == 2 and rows.shape[1] == 8 and times is None:
         rows, times = rows[:, 1:], rows[:, 0]
     note = f"the columns have no names and were read as {' '.join(POSE)}"
@@ -78,16 +78,16 @@ def by_place(rows: np.ndarray, times: np.ndarray | None = None) -> Table:
 
 
 def check_order(quat: np.ndarray, rest: Rotation, label: str, cure: str) -> None:
-    """Refuse an orientation that makes sense only with its numbers in the order x y z w.
+    """Refuse an orientation that makes sense only if its components are in the order x y z w.
 
     Args:
         quat: (4,), read as wxyz.
-        rest: how the object rests.
-        label: what it is, in the message.
-        cure: how to name the order.
+        rest: orientation in which the object rests on the table.
+        label: name of the orientation in the message.
+        cure: advice in the message on how to state the order.
 
     Raises:
-        ConfigError: so read it is far from how the object rests, and in the other order it is not.
+        ConfigError: read as wxyz it is far from the resting orientation, read as xyzw it is near.
     """
     taken, other = (Rotation.from_quat(quat, scalar_first=f) * rest.inv() for f in (True, False))
     tilts = [float(np.arccos(np.clip(r.as_matrix()[2, 2], -1, 1))) for r in (taken, other)]
@@ -96,7 +96,7 @@ def check_order(quat: np.ndarray, rest: Rotation, label: str, cure: str) -> None
     if tilted or (flipped and tilts[0] > tilts[1] - _LEVEL_RAD):
         raise ConfigError(
             f"{label}: read as w x y z its orientation is {np.rad2deg(taken.magnitude()):.0f} "
-            f"degrees from how the object rests, as x y z w only "
+            f"degrees from the object's resting orientation, as x y z w only "
             f"{np.rad2deg(other.magnitude()):.0f}; {cure}"
         )
 

@@ -1,4 +1,4 @@
-"""Expert hand trajectories in the library's form: plain arrays, checked."""
+"""Expert hand trajectories in the library's format: plain arrays, checked when read and written."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from pgdm.library.files.motion import numbers
 HAND = "adroit"
 """The robot hand of the trajectories."""
 FINGERS = ("ff", "mf", "lf", "rf", "th")
-"""Order of the fingers in all arrays: fore, middle, little, ring finger, thumb."""
+"""Order of the fingers in all arrays: index, middle, little, ring finger, thumb."""
 FINGERTIPS = tuple(f"{finger}distal_point" for finger in FINGERS)
-"""Their points of that hand."""
+"""Fingertips of that hand, as geoms and bodies of its model."""
 
 JOINTS = 30
-"""Joints of Adroit: six of the base, then wrist and fingers."""
+"""Number of Adroit's joints: six of the base, then wrist and fingers."""
 
 HUMAN_JOINTS = 16
-"""Joints of the human hand (MANO): wrist; index, middle, little, ring finger, thumb, three each."""
+"""Number of joints of the human hand (MANO): wrist, then three each of index, middle, little and
+ring finger and thumb."""
 
 
 @dataclass(frozen=True)
@@ -37,18 +38,18 @@ class Expert:
     task: str
     """Task id."""
     qpos: np.ndarray = field(repr=False)
-    """Adroit's joint positions (T, 30) as published; they may exceed the joints' limits."""
+    """Adroit's joint positions (T, 30), not clipped: they may exceed the joints' limits."""
     human_joints: np.ndarray = field(repr=False)
-    """Joint locations of the human hand (T, 16, 3), MANO order; a finger's last is its DIP."""
+    """Joint locations of the human hand (T, 16, 3), MANO order; the last of a finger is its DIP."""
     fingertips: np.ndarray = field(repr=False)
     """Adroit's fingertips (T, 5, 3) at the joint positions clipped to their limits."""
     contacts: np.ndarray = field(repr=False)
     """Points of the object closest to the human fingers (T, 5, 3), in the frame of the object's
-    body (origin of the body, not its centre of mass)."""
+    body (whose origin is not the centre of mass)."""
     in_contact: np.ndarray = field(repr=False)
-    """Whether the finger touches the object there (T, 5), bool."""
+    """Whether each finger touches the object (T, 5), bool."""
     approximate: bool
-    """Whether it was rebuilt from another recording of the same motion, not published."""
+    """True if rebuilt from another recording of the same motion, False if published."""
     sha256: str
     """Hash of its file in the library."""
 
@@ -61,7 +62,7 @@ def check(arrays: Mapping[str, Any], label: str) -> dict[str, np.ndarray]:
         label: the file's name in messages.
 
     Raises:
-        CorruptAssetError: an array is missing, has a wrong shape or type, or a NaN.
+        CorruptAssetError: an array is missing, has a wrong shape or type, or is not finite.
     """
     qpos = numbers(arrays, "qpos", label, (None, JOINTS))
     steps, fingers = len(qpos), len(FINGERS)
@@ -83,11 +84,11 @@ def flags(
     """Return a bool array of a given shape, where None stands for any length.
 
     Raises:
-        CorruptAssetError: it is missing, of another shape, or has values other than 0 and 1.
+        CorruptAssetError: the array is missing, has another shape, or values other than 0 and 1.
     """
     value = numbers(arrays, key, label, shape)
     if not np.isin(value, (0.0, 1.0)).all():
-        raise CorruptAssetError(f"{label}: '{key}' holds other values than 0 and 1")
+        raise CorruptAssetError(f"{label}: '{key}' holds values other than 0 and 1")
     return value.astype(bool)
 
 
@@ -104,7 +105,7 @@ def read(path: Path, task: str) -> Expert:
     """Read an expert trajectory.
 
     Raises:
-        CorruptAssetError: the file is missing, damaged, or holds impossible values.
+        CorruptAssetError: the file is missing, damaged, or holds invalid values.
     """
     stored, digest = npz.read_hashed(path)
     arrays = check(stored, str(path))

@@ -1,4 +1,4 @@
-"""The index of the library's expert trajectories: origin and quality of each."""
+"""The index of the library's expert hand trajectories: origin and quality of each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pgdm.library import manifest as manifests
 from pgdm.library.manifest import FileEntry
 
 FORMAT = 1
-"""Version of the folder's layout and of the procedure that fills it."""
+"""Version of the folder's layout and of the code that fills the folder."""
 
 _CURE = "fill them again with 'pgdm assets fetch'"
 
@@ -20,32 +20,32 @@ class ExpertEntry:
     """One task's expert trajectory: provenance and quality."""
 
     file: FileEntry
-    """Hash and size of its file; origin inside the package, licence."""
+    """Hash, size and licence of its file, and the path inside the package."""
     package: str
-    """Package it came from, with version and hash."""
+    """Package from which it was made, with version and hash."""
     approximate: bool
-    """Whether it was rebuilt from another recording of the same motion, not published."""
+    """True if rebuilt from another recording of the same motion, False if published."""
     steps: int
-    """Rows T, one for each pose of the motion."""
+    """Number of rows T, one for each pose of the motion."""
     skipped: int
-    """Frames k of the recording before the motion's first pose."""
+    """Number of frames of the recording before the motion's first pose."""
     shift_m: list[float]
     """Offset (3,) m, world frame, added to the recorded positions so that the object is where the
     motion has it."""
     object_mean_m: float
-    """Distance of the recording's object from the motion's after that, mean over the poses."""
+    """Distance of the recording's object from the motion's after that shift, mean over poses."""
     object_max_m: float
     """Largest such distance over the poses."""
     beyond_limits_m: float
-    """How far the base's slides exceed their limits at most."""
+    """Largest excess of the base's slides over their limits."""
     beyond_limits_rad: float
-    """How far the hinges exceed their limits at most."""
+    """Largest excess of the hinges over their limits."""
     touching_frames: int
-    """Poses at which the hand touches the object according to the recording."""
+    """Number of poses at which the hand touches the object according to the recording."""
     contact_frames: list[int]
-    """Touching poses with the finger in contact, by finger (fore, middle, little, ring, thumb)."""
+    """Number of these poses with the finger in contact (index, middle, little, ring, thumb)."""
     within_5mm: list[float]
-    """Share of the touching poses with the finger within 5 mm of the object, by finger."""
+    """Share of these poses with the finger within 5 mm of the object, by finger."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class ExpertIndex:
     experts: dict[str, ExpertEntry]
     """Expert trajectories by task id."""
     left_out: dict[str, str]
-    """Tasks without one that the package should have, with the reason."""
+    """Motion-capture tasks without a usable trajectory in the package, with the reason."""
     format: int = FORMAT
     """Layout version."""
 
@@ -71,7 +71,7 @@ def read(folder: Path) -> ExpertIndex:
     """Read the index.
 
     Raises:
-        CorruptAssetError: it is missing, damaged or of another format.
+        CorruptAssetError: the index is missing, damaged or of another format.
     """
     return manifests.read_json(folder / manifests.NAME, _from_json, FORMAT, _CURE)
 

@@ -1,10 +1,11 @@
 """Smooth object motions from keyframes.
 
-Positions are quintic splines, and so are the rotation vectors relative to the orientation at the
-last rest. The velocity at a keyframe is the slope of a monotone cubic interpolant, zero at rests;
-the acceleration at keyframes is zero. So the motion is twice continuously differentiable, starts
-and ends at rest, and passes through every keyframe. Between two keyframes alone it is the
-minimum-jerk profile ``10 s^3 - 15 s^4 + 6 s^5``, along a line and by slerp.
+Positions are quintic splines of time, as are the rotation vectors relative to the orientation at
+the last rest. The velocity at a keyframe is the slope of a monotone cubic interpolant, zero at
+rests; the acceleration at keyframes is zero. Thus the motion is twice continuously differentiable,
+starts and ends at rest, and passes through every keyframe. If the object rests at two consecutive
+keyframes, it moves between them along a line and by slerp, with the minimum-jerk profile
+``10 s^3 - 15 s^4 + 6 s^5``.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from pgdm.library.files.columns import check_order
 from pgdm.library.tasks import STEP_S
 
 LONGEST_S = 3600.0
-"""Longest motion that is sampled, s; the limits of tasks are checked afterwards."""
+"""Longest motion that is sampled, s; `checks.motion` has the stricter limits of tasks."""
 
 FRAMES = ("rest", "world")
 _KEYS = ("frame", "place", "keyframes")
@@ -40,24 +41,25 @@ class Keyframe:
 
     time_s: float
     pos: np.ndarray = field(repr=False)
-    """(3,) m, of the centre of mass: in frame ``rest`` relative to where the object rests, along
-    the world's axes."""
+    """(3,) m, position of the centre of mass along the world's axes; in frame ``rest`` relative to
+    its resting position."""
     quat: np.ndarray = field(repr=False)
-    """(4,) wxyz: in frame ``rest`` the rotation from how it rests, about the world's axes."""
+    """(4,) wxyz, orientation; in frame ``rest`` the rotation from the resting orientation, about
+    the world's axes."""
     stop: bool
     """Whether the object comes to rest there."""
 
 
 @dataclass(frozen=True)
 class Animation:
-    """Keyframes, and how the object is first placed on the table."""
+    """Keyframes, and the pose at which the object is put on the table before the motion."""
 
     frame: str
-    """``rest``: relative to how the object comes to rest; ``world``: absolute."""
+    """``rest``: keyframes relative to the object's resting pose; ``world``: absolute."""
     place: np.ndarray = field(repr=False)
-    """(2,) m, position on the table in frame ``rest``."""
+    """(2,) m, where the object is put on the table; for frame ``rest`` only."""
     quat: np.ndarray = field(repr=False)
-    """(4,) wxyz, orientation when placed there, relative to its own axes."""
+    """(4,) wxyz, orientation in which it is put there, world frame."""
     keyframes: tuple[Keyframe, ...]
 
     @property
@@ -72,11 +74,11 @@ class Animation:
         return sample(self.keyframes, times)
 
     def at(self, pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the trajectory in the world frame, for an object that rests at a pose.
+        """Return the trajectory in the world frame, as :meth:`trajectory`, for a resting pose.
 
         Args:
-            pos: its centre of mass (3,) m.
-            quat: its orientation (4,) wxyz.
+            pos: centre of mass (3,) m of the resting object.
+            quat: orientation (4,) wxyz of the resting object.
         """
         moves, orientations = self.trajectory()
         if self.frame == "world":
@@ -91,8 +93,8 @@ def sample(keyframes: Sequence[Keyframe], times: np.ndarray) -> tuple[np.ndarray
 
     Args:
         keyframes: two or more, in order of time; the object rests at the first and the last, at
-            those with ``stop``, and between two with equal poses.
-        times: within the keyframes' time.
+            keyframes with ``stop``, and between consecutive keyframes with equal poses.
+        times: must be within the time span of the keyframes.
     """
     key_times = np.array([k.time_s for k in keyframes])
     pos = np.array([k.pos for k in keyframes])
@@ -111,13 +113,13 @@ def sample(keyframes: Sequence[Keyframe], times: np.ndarray) -> tuple[np.ndarray
 
 
 def continuous(quats: np.ndarray) -> np.ndarray:
-    """Return orientations (T, 4) with signs such that neighbours have non-negative dot products."""
+    """Return quaternions (T, 4) with signs chosen so that consecutive dot products are >= 0."""
     flips = np.where((quats[1:] * quats[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return quats * np.concatenate(([1.0], np.cumprod(flips)))[:, None]
 
 
 def _rests(keyframes: Sequence[Keyframe]) -> list[int]:
-    """Return the indices of the keyframes at which the object rests, with the first and last."""
+    """Return the indices of the keyframes at which the object rests, including first and last."""
     same = [
         np.array_equal(a.pos, b.pos) and np.array_equal(a.quat, b.quat)
         for a, b in pairwise(keyframes)
@@ -131,10 +133,10 @@ def _rests(keyframes: Sequence[Keyframe]) -> list[int]:
 
 
 def _spline(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return the quintic curve through values (n, 3) at wanted times, at rest at both ends.
+    """Return, at wanted times, the quintic curve through values (n, 3), at rest at both ends.
 
-    Inside, its slopes are those of a monotone interpolant, so a coordinate does not overshoot its
-    highest and lowest keyframes.
+    In between, the slopes at the given times are those of a monotone interpolant, so that a
+    coordinate does not overshoot its highest and lowest keyframes.
     """
     slopes = PchipInterpolator(times, values).derivative()(times)
     slopes[[0, -1]] = 0.0
@@ -143,9 +145,9 @@ def _spline(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.nda
 
 
 def _vectors(base: Rotation, orientations: Rotation) -> np.ndarray:
-    """Return rotation vectors (n, 3) rad from the base, each the nearest to the one before.
+    """Return rotation vectors (n, 3) rad from the base, each as near as possible to the previous.
 
-    So four quarter turns make a full turn, although the first and last orientations are equal.
+    Thus four quarter turns make a full turn, although the first and last orientations are equal.
     """
     vectors = (base.inv() * orientations).as_rotvec()
     for i in range(1, len(vectors)):
@@ -166,7 +168,7 @@ def read(path: Path) -> Animation:
     """Read keyframes from a YAML file; docs/authoring.md describes it.
 
     Raises:
-        ConfigError: the file cannot be read, or something in it is wrong; names what.
+        ConfigError: the file cannot be read, or an entry is wrong; the message names it.
     """
     try:
         text = files.read_text(path)
@@ -183,7 +185,7 @@ def parse(text: str, label: str) -> Animation:
         label: its name in messages.
 
     Raises:
-        ConfigError: something in it is wrong; names what.
+        ConfigError: an entry is wrong; the message names it.
     """
     try:
         content = files.parse_yaml(text)
@@ -198,11 +200,11 @@ def animation(content: Mapping[str, Any], label: str) -> Animation:
     """Return the animation that a parsed file describes.
 
     Args:
-        content: its keys.
-        label: its name in messages.
+        content: the file's top-level keys.
+        label: the file's name in messages.
 
     Raises:
-        ConfigError: something in it is wrong; names what.
+        ConfigError: an entry is wrong; the message names it.
     """
     _known(content, _KEYS, label)
     frame = content.get("frame", "rest")
@@ -244,7 +246,7 @@ def _check_times(keyframes: Sequence[Keyframe], label: str) -> None:
     for i, (one, two) in enumerate(pairwise(times)):
         if not two - one >= _MIN_GAP_S - 1e-9:
             raise ConfigError(
-                f"{label}: keyframe {i + 1} at {two:g} s does not come {_MIN_GAP_S:g} s or more "
+                f"{label}: keyframe {i + 1} at {two:g} s must come {_MIN_GAP_S:g} s or more "
                 f"after keyframe {i} at {one:g} s"
             )
     if times[-1] > LONGEST_S:
@@ -254,7 +256,7 @@ def _check_times(keyframes: Sequence[Keyframe], label: str) -> None:
 
 
 def _quat(key: Mapping[str, Any], label: str) -> np.ndarray:
-    """Return a keyframe's orientation (4,) wxyz, by default the identity."""
+    """Return the orientation (4,) wxyz of a keyframe or place, by default the identity."""
     if "quat" in key and "euler_deg" in key:
         raise ConfigError(f"{label}: both quat and euler_deg are given; remove one")
     if "quat" not in key:

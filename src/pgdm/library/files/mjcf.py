@@ -1,10 +1,10 @@
-"""Writing MJCF: elements, and the defaults that TCDM's models share."""
+"""Writing MJCF: elements, and the defaults shared by TCDM's models (the authors' repository)."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 
-# Read off the compiled models of a TCDM checkout. Lengths in m, densities in kg/m3.
+# Taken from the compiled models of a TCDM checkout. Lengths in m, densities in kg/m3.
 _COMMON_DEFAULTS: dict[str, dict[str, str]] = {
     "joint": {
         "limited": "true",
@@ -56,7 +56,7 @@ def model(name: str) -> ET.Element:
 
 
 def add(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:
-    """Append an element; ``class_`` stands for ``class``."""
+    """Append an element and return it; write the attribute ``class`` as ``class_``."""
     element = ET.SubElement(parent, tag)
     element.attrib.update({key.rstrip("_"): value for key, value in attributes.items()})
     return element
@@ -79,7 +79,7 @@ def object_defaults(root: ET.Element) -> None:
 
 
 def object_body(root: ET.Element, inertial: dict[str, str] | None = None) -> ET.Element:
-    """Append an object's body with its six joints: three slides, then three hinges.
+    """Append and return an object's body with its six joints: three slides, then three hinges.
 
     Args:
         root: the model.

@@ -23,20 +23,20 @@ _NUMERIC_NAMES = (
 _NUMERIC = frozenset(_NUMERIC_NAMES.split())
 _DROPPED_NAMES = "njmax nconmax nstack apirate collision mpr_iterations mpr_tolerance"
 _DROPPED = frozenset(_DROPPED_NAMES.split())
-"""Attributes of ``size`` and ``option`` that MuJoCo no longer accepts; none changes a trajectory:
-the first three only bounded memory."""
+"""Attributes of ``size`` and ``option`` that MuJoCo no longer accepts. Dropping them changes no
+trajectory: the first three only limited memory."""
 
 
 def parse(path: Path, defects: list[str], root: Path, includes: Path | None = None) -> ET.Element:
     """Parse an MJCF file and insert its includes.
 
-    File attributes become absolute. Numbers with a typing error are read as older versions of
-    MuJoCo read them, and reported.
+    File attributes become absolute paths. Numbers followed by stray characters are read as older
+    versions of MuJoCo did, and reported.
 
     Args:
         path: the file.
         defects: messages about repairs are appended.
-        root: folder to which names in messages are relative; includes must not leave it.
+        root: folder that no file of the model may leave; names in messages are relative to it.
         includes: folder of the included files, by default that of the including file.
 
     Raises:
@@ -87,7 +87,7 @@ def _check_depth(element: ET.Element) -> None:
 
 
 def name_in(path: Path, root: Path) -> str:
-    """Return a file's name for people: relative to the data tree if it is inside."""
+    """Return a file's name for messages: relative to ``root`` if inside, else without folder."""
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
 
 
@@ -100,10 +100,10 @@ def _inside(path: Path, root: Path, label: str) -> Path:
 
 
 def check_stays(path: Path, root: Path) -> None:
-    """Refuse a link that leads out of somebody else's data tree.
+    """Check that a path in third-party data is not a link that leads out of ``root``.
 
     Raises:
-        CorruptAssetError: names both ends.
+        CorruptAssetError: it is; the message names the file and its target.
     """
     if leaves(path, root):
         raise CorruptAssetError(
@@ -133,7 +133,9 @@ def _repair(item: ET.Element, label: str, defects: list[str]) -> None:
         if all(token == number for token, number in zip(tokens, read, strict=True)):
             continue
         if any(number is None for number in read):
-            raise CorruptAssetError(f'{label}: {item.tag} {key}="{item.attrib[key]}" has no number')
+            raise CorruptAssetError(
+                f'{label}: {item.tag} {key}="{item.attrib[key]}" is not numeric'
+            )
         fixed = " ".join(str(number) for number in read)
         defects.append(f'{label}: {item.tag} {key}="{item.attrib[key]}" read as "{fixed}"')
         item.set(key, fixed)
@@ -152,10 +154,10 @@ def write(model: ET.Element, path: Path, note: str) -> list[tuple[Path, Path]]:
     Args:
         model: as from :func:`parse`; changed in place.
         path: the file to write.
-        note: one line about its origin, written as a comment.
+        note: line about the model's origin, written as a comment.
 
     Returns:
-        Pairs (written file, file it was copied from), without the model's own file.
+        Pairs (written file, file it was copied from) of the meshes and textures.
 
     Raises:
         CorruptAssetError: a mesh or texture is missing.

@@ -1,4 +1,4 @@
-"""Exemplar motions in the library's form: plain arrays, checked."""
+"""Exemplar motions in the library's format: plain arrays, checked when read and written."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Start:
     qvel: np.ndarray = field(repr=False)
     """Joint velocities (nv,), m/s and rad/s."""
     actions: np.ndarray | None = field(repr=False)
-    """Normalised actions (K, nu) of the reach plan that leads here, None if not stored."""
+    """Actions (K, nu) in [-1, 1] of the reach plan that leads to this state, None if not stored."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class Motion:
     id: str
     """Task id the motion belongs to."""
     source: str
-    """Library source that it was read from, such as ``checkout``."""
+    """Library source from which it was read, such as ``checkout``."""
     translation: np.ndarray = field(repr=False)
-    """Recorded position (T, 3) m, world frame: the mesh's origin, used by the released code as the
-    target of the centre of mass, see `ReferenceCfg.frame`."""
+    """Recorded position of the mesh's origin (T, 3) m, world frame. The released code uses it as
+    the target of the centre of mass, see `ReferenceCfg.frame`."""
     orientation: np.ndarray = field(repr=False)
     """Target of the object body's orientation (T, 4), unit quaternion wxyz."""
     substeps: int
@@ -62,10 +62,12 @@ def check(
         label: the file's name in messages.
 
     Returns:
-        Translation (T, 3) m, orientation (T, 4) wxyz, physics steps per control step, starts.
+        Translation (T, 3) m, orientation (T, 4) wxyz, physics steps per control step, start states
+        by name.
 
     Raises:
-        CorruptAssetError: an array is missing, has a wrong shape, NaN, or no unit quaternions.
+        CorruptAssetError: an array is missing, has a wrong shape, or is not finite, or a quaternion
+            is not unit.
     """
     translation = numbers(arrays, "object_translation", label, (None, 3))
     steps = len(translation)
@@ -84,10 +86,10 @@ def check(
 
 
 def check_unit(quaternions: np.ndarray, key: str, label: str) -> None:
-    """Check that quaternions (T, 4) are unit.
+    """Check that quaternions (T, 4) have norm 1.
 
     Raises:
-        CorruptAssetError: one is not; names the worst row.
+        CorruptAssetError: one does not; the message names the worst row.
     """
     norms = np.linalg.norm(quaternions, axis=1)
     worst = int(np.abs(norms - 1.0).argmax())
@@ -101,10 +103,10 @@ def start(arrays: Mapping[str, Any], prefix: str, label: str) -> Start:
     """Return the start state from the arrays whose names begin with a prefix.
 
     Raises:
-        CorruptAssetError: an array is missing, has a wrong shape, or holds NaN.
+        CorruptAssetError: an array is missing, has a wrong shape, or is not finite.
     """
     qpos = numbers(arrays, f"{prefix}_qpos", label, (None,))
-    # All joints have one degree of freedom: as many velocities as positions.
+    # All joints have one degree of freedom, so there are as many velocities as positions.
     qvel = numbers(arrays, f"{prefix}_qvel", label, (len(qpos),))
     actions = None
     if f"{prefix}_actions" in arrays:
@@ -129,7 +131,7 @@ def numbers(
     """Return a finite float64 array of a given shape, where None stands for any length.
 
     Raises:
-        CorruptAssetError: it is missing, not numeric, of another shape, or not finite.
+        CorruptAssetError: the array is missing, not numeric, of another shape, or not finite.
     """
     if key not in arrays:
         raise CorruptAssetError(f"{label}: lacks '{key}'; it has {', '.join(sorted(arrays))}")
@@ -177,7 +179,7 @@ def read(path: Path, motion_id: str, source: str) -> Motion:
     """Read a motion.
 
     Raises:
-        CorruptAssetError: the file is missing, damaged, or holds impossible values.
+        CorruptAssetError: the file is missing, damaged, or holds invalid values.
     """
     arrays, digest = npz.read_hashed(path)
     translation, orientation, substeps, starts = check(arrays, str(path))

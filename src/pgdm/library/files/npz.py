@@ -24,27 +24,27 @@ from pgdm.library.files.pickles import (
 )
 
 MAX_MEMBER_BYTES = 256 * 2**20
-"""Largest array that is read, bytes; the released ones have a few thousand."""
+"""Largest array that is read, bytes; the released arrays have a few thousand."""
 
 
 def read_npz(path: Path) -> dict[str, Any]:
-    """Read all arrays of an ``.npz``; pickled ones through :func:`loads`.
+    """Read all arrays of an ``.npz``; pickled arrays through :func:`loads`.
 
     Returns:
         Name to array; a pickled array without dimensions is returned as its object.
 
     Raises:
         UnsafePickleError: a pickled array requires more than plain values.
-        CorruptAssetError: the file is missing, truncated or not an ``.npz``; names file and reason.
+        CorruptAssetError: the file is missing, truncated or not an ``.npz``.
     """
     return read_hashed(path)[0]
 
 
 def read_hashed(path: Path) -> tuple[dict[str, Any], str]:
-    """Read all arrays of an ``.npz`` as :func:`read_npz`, and the file's SHA-256, hexadecimal.
+    """Return the arrays of an ``.npz`` as :func:`read_npz` does, and the file's SHA-256 (hex).
 
     Raises:
-        CorruptAssetError: as for :func:`read_npz`.
+        CorruptAssetError: as for :func:`read_npz`, including UnsafePickleError.
     """
     result: dict[str, Any] = {}
     try:
@@ -70,22 +70,22 @@ def read_hashed(path: Path) -> tuple[dict[str, Any], str]:
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write arrays as an ``.npz`` and create its folder; equal arrays always give equal bytes."""
     buffer = io.BytesIO()
-    # np.savez writes a fixed date into the zip, so the file's hash depends on the arrays only.
+    # NumPy writes a fixed date into the zip, so the file's hash depends only on the arrays.
     np.savez_compressed(buffer, **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(buffer.getvalue())
 
 
 def parse_npy(data: bytes, label: str) -> Any:
-    """Parse the content of an ``.npy`` file; a pickled one through :func:`loads`.
+    """Parse the content of an ``.npy`` file; a pickled array through :func:`loads`.
 
     Args:
         data: the file's content.
         label: its name in messages.
 
     Raises:
-        UnsafePickleError: it is a pickle that requires more than plain values.
-        CorruptAssetError: it cannot be read.
+        UnsafePickleError: the array is pickled and requires more than plain values.
+        CorruptAssetError: the content cannot be read.
     """
     stream = io.BytesIO(data)
     try:

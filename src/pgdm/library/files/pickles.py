@@ -1,9 +1,9 @@
 """Reading pickles without running code from them.
 
 TCDM stores its start states in a pickled object array; ``numpy.load(allow_pickle=True)`` would run
-whatever code such a file names. Here a pickle is first read as a list of opcodes, of which only
-those that build plain values are allowed, and then loaded with stand-ins for NumPy's few helpers,
-so that not even NumPy's own ``__setstate__`` sees the file's bytes.
+any code that such a file names. Here a pickle is first read as a list of opcodes, of which only
+those that build plain values are allowed, and then loaded with stand-ins for the few NumPy
+functions that arrays need, so that not even NumPy's ``__setstate__`` sees the file's bytes.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class _DType:
         self.big = state[1] == ">"
 
     def real(self) -> np.dtype[Any]:
-        """Return the dtype it stands for: numbers, strings or objects."""
+        """Return the dtype that it replaces: numbers, strings or objects."""
         if self.code in ("O", "O8"):
             return np.dtype(object)
         dtype = np.dtype(self.code)
@@ -113,7 +113,7 @@ def _array(data: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
 
 
 class _Helper:
-    """A callable that a pickle may use; without ``__dict__``, so that it cannot be changed."""
+    """A callable that a pickle may use; has no ``__dict__``, so that a pickle cannot modify it."""
 
     __slots__ = ("_name",)
 
@@ -155,7 +155,7 @@ for _core in ("numpy.core", "numpy._core"):
 
 
 class _Object:
-    """Stands in for an object of a class that is not loaded: keeps its attributes, does nothing."""
+    """Stands in for an object whose class is not imported: keeps only the pickled state."""
 
     __slots__ = ("state",)
 
@@ -209,7 +209,7 @@ def _scan(data: bytes, label: str, objects: Sequence[str]) -> None:
 
 
 def _plain(value: Any, seen: dict[int, Any], depth: int = 0) -> Any:
-    """Replace the stand-ins in ``value`` by what they stand for."""
+    """Replace the stand-ins in ``value`` by the plain values that they hold."""
     if depth > _MAX_DEPTH:
         raise ValueError(f"values nested deeper than {_MAX_DEPTH}")
     if isinstance(value, _Helper | _DType | type):
@@ -219,7 +219,7 @@ def _plain(value: Any, seen: dict[int, Any], depth: int = 0) -> Any:
     result = value
     if isinstance(value, _Object):
         state = value.state
-        if isinstance(state, dict):  # of no use to anybody: a space's dtype, a class
+        if isinstance(state, dict):  # drop types, such as the dtype of a Gym space
             state = {k: v for k, v in state.items() if not isinstance(v, _Helper | _DType | type)}
         result = _plain(state, seen, depth + 1)
     elif isinstance(value, _Array):
@@ -244,15 +244,15 @@ def loads(data: bytes, label: str, objects: Sequence[str] = ()) -> Any:
         data: the pickle.
         label: the file's name in messages.
         objects: packages whose objects are permitted; none is imported, and each object is
-            returned as its pickled state, mostly a dict of its attributes.
+            returned as its pickled state, usually a dict of its attributes.
 
     Raises:
-        UnsafePickleError: it requires anything else.
-        CorruptAssetError: it cannot be read.
+        UnsafePickleError: the pickle requires anything else.
+        CorruptAssetError: the pickle cannot be read.
     """
     try:
         with warnings.catch_warnings():
-            # An invalid escape in a string is the file's fault, not the program's.
+            # Python warns of invalid escapes in pickled strings; the user cannot act on that.
             warnings.simplefilter("ignore", DeprecationWarning)
             _scan(data, label, objects)
             return _plain(_Unpickler(data, label, objects).load(), {})
@@ -269,7 +269,7 @@ def read_bytes(path: Path) -> bytes:
     """Return a file's content.
 
     Raises:
-        CorruptAssetError: it cannot be read, or is too large.
+        CorruptAssetError: the file cannot be read, or is too large.
     """
     try:
         return files.read_bytes(path, MAX_FILE_BYTES)

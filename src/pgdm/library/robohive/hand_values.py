@@ -1,12 +1,15 @@
-"""As :mod:`pgdm.library.robohive.model_values`, for D'Hand and D'Manus."""
+"""Values by which TCDM's D'Hand and D'Manus differ from those in the package ``robohive``.
+
+:mod:`pgdm.library.robohive.model_values` has the units and says how the values were obtained.
+"""
 
 from __future__ import annotations
 
 HIGH_BASE_RANGES = {"ARTz": "-0.1 0.7"}
-"""Joint ranges of the base that differ in D'Hand and D'Manus; the control ranges are the same."""
+"""Base joint ranges of D'Hand and D'Manus that differ from Adroit's; control ranges are equal."""
 
 DHAND_MOUNT = {"pos": "0 -0.7 0.2", "euler": "1.57 3.14 0"}
-"""Pose of D'Hand's wrist."""
+"""Pose of D'Hand's first body, the wrist, in the world."""
 
 DHAND_BASE_GAINS = {"T": "175", "R": "150"}
 """Gains of D'Hand's base actuators."""
@@ -44,7 +47,7 @@ DHAND_NAMES: dict[str, dict[int, str]] = {
         )
     },
 }
-"""Names of D'Hand's geoms in its contact pairs, by body and index."""
+"""Names given to D'Hand's geoms for the contact pairs, by body and index."""
 
 DHAND_POINTS: dict[str, tuple[str, str]] = {
     "wrist-adb": ("wrist_point", "0 0 0"),
@@ -60,14 +63,14 @@ DHAND_POINTS: dict[str, tuple[str, str]] = {
         for part, place in (("middle", "0 0 0"), ("distal", "0 0 0.045"))
     },
 }
-"""D'Hand's tracked points by carrying body: name, position of the sphere in it."""
+"""D'Hand's tracked points by carrying body: name, position of the sphere in that body."""
 
 DHAND_CLASSES: dict[str, dict[str, str]] = {
     "vis_metal": {"group": "5"},
     "phys_metal": {"contype": "1", "condim": "4", "margin": "0.001", "group": "4"},
 }
-"""Contact settings of D'Hand's geoms; ``phys_metal`` collides in pairs and where another geom's
-``conaffinity`` allows it."""
+"""Contact settings of D'Hand's geoms. ``phys_metal`` geoms collide in contact pairs and with geoms
+whose ``conaffinity`` allows it."""
 
 POINT_CLASS = {
     "type": "sphere",
@@ -80,16 +83,16 @@ POINT_CLASS = {
 """Spheres of the tracked points of D'Hand and D'Manus."""
 
 DMANUS_MOUNT = {"pos": "0 -0.7 0.2", "euler": "-1.57 0 3.14"}
-"""Pose of D'Manus' stand."""
+"""Pose of D'Manus' stand, its first body, in the world."""
 
 DMANUS_PALM = "0 0 0.09125"
-"""Position of its palm on the stand."""
+"""Position of D'Manus' palm in the stand's frame."""
 
 DMANUS_BASE_GAINS = {"T": "50", "R": "25"}
 """Gains of D'Manus' base actuators."""
 
 DMANUS_GAIN, DMANUS_DAMPING, DMANUS_ARMATURE = "10", "1", "0.001"
-"""Gain of its other actuators, damping and armature of its joints; in the package: 100, 5, 0."""
+"""Gain of D'Manus' other actuators, damping and armature of its joints; package: 100, 5, 0."""
 
 DMANUS_RANGES = {
     "TFJ1": "-0.75 0.57",
@@ -103,8 +106,8 @@ DMANUS_RANGES = {
     "LFJ2": "0.0 1.54",
     "LFJ3": "0.0 1.48",
 }
-"""Ranges of D'Manus' joints and controls, in the actuators' order. ``TFJ2e`` turns the second copy
-of the thumb's middle link that TCDM's hand has."""
+"""Ranges of D'Manus' joints and controls, in the actuators' order. ``TFJ2e`` moves the second
+copy of the thumb's middle link, which only TCDM's hand has."""
 
 DMANUS_POINTS: dict[str, tuple[str, str]] = {
     "palm": ("wrist_point", "0 0 0"),
@@ -121,7 +124,7 @@ DMANUS_POINTS: dict[str, tuple[str, str]] = {
         )
     },
 }
-"""D'Manus' tracked points by carrying body: name, position of the sphere in it."""
+"""D'Manus' tracked points by carrying body: name, position of the sphere in that body."""
 
 _DMANUS_LINKS = {
     # Geoms of thumb, index and little finger, the tip last, paired in this order.
@@ -141,4 +144,4 @@ DMANUS_PAIRS: tuple[tuple[str, str], ...] = (
         for tip in (1, 2, 3)
     ),
 )
-"""Contact pairs of D'Manus. Two name an otherwise visual mesh, as in TCDM."""
+"""Contact pairs of D'Manus. Two of them use a mesh that is otherwise only visual, as in TCDM."""

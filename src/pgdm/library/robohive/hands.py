@@ -137,7 +137,7 @@ def _dmanus_defaults(root: ET.Element) -> None:
 
 
 def _lengthen_thumb(palm: ET.Element) -> None:
-    """Insert a second copy of the thumb's middle link between the first and the fingertip."""
+    """Insert a second copy of the thumb's middle link between that link and the fingertip."""
     middle = next((b for b in palm.iter("body") if b.get("name") == "thumb_middle"), None)
     tip = None if middle is None else middle.find("body")
     if middle is None or tip is None:
@@ -155,7 +155,7 @@ def _lengthen_thumb(palm: ET.Element) -> None:
 def _dmanus_body(palm: ET.Element) -> None:
     for item in palm.iter():
         name = item.get("class", "")
-        if name.endswith("_dhand"):  # the fragments of both hands use these names
+        if name.endswith("_dhand"):  # the fragments of both hands use this suffix
             item.set("class", name.replace("_dhand", "_dmanus"))
         if item.tag == "joint":
             item.set("range", values.DMANUS_RANGES[item.attrib["name"]])

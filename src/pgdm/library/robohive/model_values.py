@@ -1,10 +1,11 @@
 """Values by which TCDM's models differ from those in the package ``robohive``.
 
-Both come from the same simulators (``vikashplus/object_sim``, ``Adroit``, ...). The package has the
-meshes, body trees and geoms; these values turn them into the benchmark's models. All were read off
-the compiled models of a TCDM checkout with :mod:`pgdm.library.checks.compare`.
-:mod:`pgdm.library.robohive.hand_values` has those of D'Hand and D'Manus. Lengths in m, angles in
-rad, masses in kg, gains in N/m and Nm/rad.
+TCDM is the paper authors' repository. Both sets of models derive from the same sources
+(``vikashplus/object_sim``, ``Adroit``, ...). The package has the meshes, body trees and geoms;
+these values turn them into the benchmark's models. All were taken from the compiled models of a
+TCDM checkout with :mod:`pgdm.library.checks.compare`. :mod:`pgdm.library.robohive.hand_values` has
+the values of D'Hand and D'Manus. Lengths in m, angles in rad, masses in kg, gains in N/m and
+Nm/rad.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ BASE_JOINTS = (
     ("ARRy", "hinge", "0 1 0", "-1.75 1.75"),
     ("ARRz", "hinge", "0 0 1", "-2.5 2.5"),
 )
-"""The six joints that place a hand: name, type, axis, range (of joint and control)."""
+"""The six base joints of a hand: name, type, axis, range of joint and control."""
 
 BASE_DAMPING = "20"
 """Damping of the base joints."""
 
 HULL_OBJECTS = frozenset({"duck"})
-"""Objects that collide as the hull of their visual mesh, not as the package's convex parts."""
+"""Objects whose collision geom is the hull of the visual mesh, not the package's convex parts."""
 
 YCB_OBJECTS: dict[str, dict[str, dict[str, str]]] = {
     "crackerbox": {
@@ -47,13 +48,13 @@ YCB_OBJECTS: dict[str, dict[str, dict[str, str]]] = {
         },
     },
 }
-"""The two YCB objects: mesh, its position, and the primitive that collides, with measured mass."""
+"""The two YCB objects: mesh, its position, and the colliding primitive with its measured mass."""
 
 ADROIT_MOUNT = {"pos": "0 -0.7 0.2", "euler": "-1.57 0 3.14"}
-"""Pose of Adroit's forearm."""
+"""Pose of Adroit's first body, the forearm, in the world."""
 
 ADROIT_FOREARM = {"size": "0.05 0.033", "pos": "0 0 0.29", "type": "capsule"}
-"""Contact geom of the forearm; the package has the hull of its mesh."""
+"""Contact geom of the forearm, for which the package uses the hull of its mesh."""
 
 ADROIT_SOLID = frozenset({"V_thbase", "V_thhub"})
 """Two boxes of 2 mm inside the thumb that collide in TCDM and are only visual in the package."""
@@ -65,7 +66,7 @@ ADROIT_WRIST_GAIN, ADROIT_FINGER_GAIN = "5", "1"
 """Gains of the other actuators; the package has 50 and 10."""
 
 ADROIT_CONTROL_RANGES = {"A_WRJ1": "-0.524 0.175"}
-"""Control ranges that differ: the package has only two digits."""
+"""Control ranges that the package rounds to two digits."""
 
 ADROIT_POINTS: dict[str, tuple[str, str, str]] = {
     "palm": ("wrist_point", "0 0 0", "0.018"),
@@ -82,9 +83,9 @@ ADROIT_POINTS: dict[str, tuple[str, str, str]] = {
     "thmiddle": ("thmiddle_point", "0 0 0", "0.012"),
     "thdistal": ("thdistal_point", "0 0 0.01", "0.0115"),
 }
-"""Tracked points by carrying body: name, position in it, radius of the sphere.
+"""Tracked points by carrying body: name, position in that body, radius of the sphere.
 
-The spheres do not collide, but each is a body of its own with the mass of its volume."""
+The spheres do not collide, but each is a separate body whose mass follows from its volume."""
 
 _SKEWED = "-0.33141357403559174 -0.1913417161825449 0.4619397662556433 0.8001031451912656"
 _FROM_THE_SIDE = "0.6532814824381883 0.27059805007309845 0.2705980500730985 0.6532814824381882"

@@ -13,7 +13,7 @@ from pgdm.library.robohive import model_values as values
 
 
 def grab_object(sims: Path, name: str, defects: list[str]) -> ET.Element:
-    """Return the model of a ContactDB object.
+    """Return the model of an object of the GRAB motions (a ContactDB object).
 
     Args:
         sims: the package's ``sims`` folder, unpacked.
@@ -52,7 +52,7 @@ def _add_geom(body: ET.Element, name: str, geom: ET.Element, hull: bool) -> None
 
 
 def ycb_object(sims: Path, name: str) -> ET.Element:
-    """Return the model of one of the two YCB objects."""
+    """Return the model of a YCB object, ``crackerbox`` or ``coffeecan``."""
     given = values.YCB_OBJECTS[name]
     mesh = given["mesh"]["name"]
     folder = sims / "YCB_sim"

