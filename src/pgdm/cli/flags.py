@@ -91,7 +91,8 @@ def _add_with_value(flags: Flags, name: str, value: str | None, waiting: list[st
         value = "all"
     if value is None:
         if not waiting or waiting[0].startswith("-"):
-            raise ConfigError(f"{name} needs a value: {' or '.join(valid or ('one',))}")
+            choice = f": {' or '.join(valid)}" if valid else ""
+            raise ConfigError(f"{name} needs a value{choice}")
         value = waiting.pop(0)
     if valid is not None and value not in valid:
         raise UnknownNameError(f"{name} value", value, valid)

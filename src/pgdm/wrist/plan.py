@@ -54,7 +54,7 @@ class WristPlan:
         This is the success of a grasp that never slips under these commands, *rigid grasp* in
         reports. A policy may exceed it, since it corrects the commands.
         """
-        return float((self.error_m < NEAR_M).mean())
+        return float((self.error_m <= NEAR_M).mean())
 
 
 def plan_wrist(

@@ -99,7 +99,7 @@ class Meter:
         return Metrics(tuple(touches), frozenset(links), distances, self._beyond(qpos))
 
     def _beyond(self, qpos: np.ndarray) -> tuple[str, ...]:
-        low, high = self._index.ctrl_low, self._index.ctrl_high
+        low, high = self._index.joint_low, self._index.joint_high
         values = qpos[: len(low)]
         outside = np.flatnonzero((values < low - BEYOND) | (values > high + BEYOND))
         return tuple(self._names[i] for i in outside)
