@@ -178,7 +178,7 @@ BAD_ZIPS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no policy": (lambda p: zipfile.ZipFile(p, "w").close(), "is no zip of"),
     "a bomb": (lambda p: zipped(p, raw=bytes(sb3.MOST_BYTES + 1)), "would unpack to"),
     "a bomb inside": (lambda p: zipped(p, raw=bomb(p)), "would unpack to"),
-    "a pickle": (lambda p: zipped(p, state={"log_std": Runs(p / "x")}), "no tensor or plain"),
+    "a pickle": (lambda p: zipped(p, state={"log_std": Runs(p / "x")}), "not a tensor or plain"),
     "a list": (lambda p: zipped(p, state=[1]), "is no mapping of tensors"),
     "ReLU": (lambda p: zipped(p, policy_kwargs=RELU), "ReLU"),
     "gSDE": (lambda p: zipped(p, use_sde=True), "explores with gSDE"),
