@@ -83,7 +83,7 @@ MINE = Method({config}, {recipe})
             METHOD.format(
                 body="return replace(r, rewards=())", config="MethodCfg", recipe="extended"
             ),
-            "a recipe needs a reward and a termination at least",
+            "a recipe needs at least one reward and one termination",
         ),
         (
             METHOD.format(
@@ -228,7 +228,7 @@ def test_actions_of_numpy_and_of_a_wrong_shape(library_home: Path) -> None:
         env.step(torch.zeros(env.action_dim))
     nothing: Any
     for nothing in (None, "x", np.full((2, 30), "x")):
-        with pytest.raises(ConfigError, match="the actions are no array of numbers"):
+        with pytest.raises(ConfigError, match="the actions are not an array of numbers"):
             env.step(nothing)
 
 
