@@ -292,7 +292,7 @@ def test_a_forged_checkpoint_gives_way_to_the_one_before(
         longer = [*TINY, "run_dir=run", "total_frames=64", "checkpoint.interval_s=1e-9"]
         outcome = command("pgdm-run", "--offline", *longer)
     assert (outcome.code, outcome.errors) == (0, []), outcome.err
-    assert "resuming from the one before" in caplog.text + outcome.err
+    assert "trying the checkpoint before it" in caplog.text + outcome.err
     evaluated = command("pgdm", "eval", "run", "--offline")
     assert evaluated.code == 0, evaluated.err
 

@@ -29,7 +29,7 @@ class CemCfg:
     """Lower bound of the standard deviation, as a share of the first one: keeps the Gaussian from
     collapsing early."""
     added: float = 0.0
-    """Share of the first standard deviation added to that of the elites, for the same reason."""
+    """Share of the first standard deviation added in each round, for the same reason."""
 
 
 class CrossEntropy:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Collection, Iterable, Sequence
 from numbers import Integral
 
-_FEW = 12  # valid names that a message lists in full
+_FEW = 12  # a message lists at most this many valid names
 
 
 class PgdmError(Exception):

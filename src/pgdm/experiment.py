@@ -44,7 +44,7 @@ from pgdm.wrist.stored import WristPlans
 _log = logging.getLogger(__name__)
 
 _LONG_DAYS = 30
-"""A run expected to take longer than this, days, is noted at its start."""
+"""Expected length of a run above which a note announces it, days."""
 
 
 def env_builder(

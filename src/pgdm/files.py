@@ -2,7 +2,7 @@
 
 Settings, run folders, checkouts and motions are all read with these functions. Without their
 checks, reading a pipe or device in place of a file might never end, and a few lines of YAML could
-fill the memory. They raise OSError if the file cannot be read, ValueError if its content is bad.
+fill the memory. OSError means that the file cannot be read, ValueError that its content is invalid.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ _MOST_STEPS = 60
 _SETTLED_RAD = 1e-7
 _STARTS = 12
 Floats = tuple[float, ...]
-_COARSE = 8  # samples of a path by which starts are compared
+_COARSE = 8  # samples of a path on which start configurations are compared
 
 MOUNTS = {
     # As in RoboHive's scene of this arm with this hand: the palm is 13 mm above the flange.
@@ -38,7 +38,7 @@ PLACES = {"dmanus": (0.2, -0.75, 90.0), "adroit": (0.2, -1.0, 90.0)}
 
 @dataclass(frozen=True)
 class Setup:
-    """Where arm, hand and table are. World frame: that of the task, z = 0 on the table top."""
+    """Where arm, hand and table are, in the task's world frame: z = 0 on the table top."""
 
     arm_at: Floats = PLACES["dmanus"]
     """Arm's base: x and y, m, and turn about the vertical, degrees."""

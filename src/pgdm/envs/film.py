@@ -55,7 +55,7 @@ class Clip:
 
     scene: Scene
     reference: ObjectReference
-    """The exemplar motion: kept in view, and the ghost's poses."""
+    """The exemplar motion, which the camera keeps in view."""
     qpos: np.ndarray  # (K, nq)
     captions: Sequence[str]
     """Text of each frame, (K,)."""

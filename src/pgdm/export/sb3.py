@@ -30,7 +30,7 @@ from pgdm.rl.networks import ActorCritic, SquashedPolicy
 from pgdm.rl.normalizer import EPS
 
 MOST_BYTES = 1 << 26
-"""Largest member of a zip that is read, bytes; a policy of the paper's has 0.4 MB."""
+"""Largest member of a zip that is read, bytes; a policy of the paper's architecture has 0.4 MB."""
 _PACKAGES = ("stable_baselines3", "gymnasium", "gym", "numpy", "collections")
 """Packages whose objects a ``VecNormalize`` file may hold."""
 _LAYER = re.compile(r"mlp_extractor\.policy_net\.(\d+)\.weight")

@@ -28,7 +28,7 @@ class ActionCfg:
     """``absolute``: joint position targets (the paper); ``residual``: the base follows the
     exemplar motion and the policy adds a correction."""
     lead_steps: int
-    """Residual: control steps by which the base's command leads the motion, against servo lag."""
+    """Residual: control steps by which the base's command leads the motion, to offset servo lag."""
     residual_scale: float
     """Residual: largest correction as a fraction of the half-range of each base joint (0..1)."""
     wrist_path: str

@@ -75,5 +75,5 @@ def add_imitation(base: Recipe, cfg: ImitationCfg) -> Recipe:
 
 
 def recipe(cfg: DeepMimicCfg) -> Recipe:
-    """Return PGDM's terms and those of imitation."""
+    """Return PGDM's terms and the imitation terms."""
     return add_imitation(pgdm.recipe(cfg), cfg.imitation)

@@ -107,7 +107,7 @@ class CheckpointFolder:
                 state = read_checkpoint(path)
                 check(state)
             except CheckpointError as error:
-                _log.warning("%s: %s; resuming from the one before", path.name, error)
+                _log.warning("%s: %s; trying the checkpoint before it", path.name, error)
                 damaged.append(path)
                 reason = str(error)
                 continue

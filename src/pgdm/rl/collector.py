@@ -77,8 +77,7 @@ class RolloutCollector(BaseCollector):
         self.env, self.policy, self.total_frames = env, policy, total_frames
         self.frames_per_batch = self.requested_frames_per_batch = frames_per_batch
         self.metrics: dict[str, float] = {}
-        """Of the last rollout: mean reward per step, number of finished episodes, and their mean
-        metrics."""
+        """Last rollout's mean reward per step, finished episodes, and their mean metrics."""
         self._learner, self._frames = learner, 0
         self._generator = torch_stream(seed, _STREAM)
         # What the learner does during a step does not depend on the step's result, so whether the

@@ -215,9 +215,7 @@ class PPOLearner:
 
         minibatch = TensorDict(_minibatch(samples, rows, _VALUE_KEYS), [len(rows)])
         error, *_ = self._loss.loss_critic(minibatch)
-        (
-            self.cfg.value_coef * error
-        ).backward()  # weighted here, so that the log has the unweighted error
+        (self.cfg.value_coef * error).backward()  # weighted here: the returned error is logged
         return error
 
 

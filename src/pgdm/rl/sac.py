@@ -38,7 +38,7 @@ class SACCfg(AlgoCfg):
     critics: int
     """Number of critics; the lowest of their values is used."""
     target_rate: float
-    """Share by which the target critics move to the critics in each update, 0..1."""
+    """Fraction by which the target critics move towards the critics in each update, 0..1."""
     batch_size: int
     """M, frames in one update."""
     updates_per_step: int
@@ -46,7 +46,7 @@ class SACCfg(AlgoCfg):
     actor_interval: int
     """Updates of the critics per update of policy and temperature."""
     target_entropy: float
-    """Entropy of the policy at which the temperature aims at first, nats per action dimension."""
+    """Target of the policy's entropy at the start, nats per action dimension."""
     target_entropy_end: float
     """Target entropy after ``target_entropy_frames``, reached linearly."""
     target_entropy_frames: int

@@ -94,7 +94,7 @@ class SoftActorCriticLoss(SACLoss):
             target_entropy=target_entropy,
             deactivate_vmap=True,
         )
-        estimator: Any = DiscountedTD0  # TorchRL takes a class as well as a name
+        estimator: Any = DiscountedTD0  # TorchRL accepts a class instead of a name
         self.make_value_estimator(estimator, value_network=None, gamma=gamma)
         self._generator = generator
 

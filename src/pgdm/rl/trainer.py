@@ -94,7 +94,7 @@ def check_state(state: State) -> None:
     """
     for name, kind in _STATE.items():
         if not isinstance(state.get(name), kind):
-            raise CheckpointError(f"it is no state of a run: '{name}' is missing or wrong")
+            raise CheckpointError(f"it is not the state of a run: '{name}' is missing or wrong")
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ class VecEnv(Protocol):
     """N copies of one task, stepped together.
 
     All tensors are on ``device``, and those returned are not changed later. After ``terminated``
-    nothing is bootstrapped. After ``truncated`` the episode could have continued: the value of
-    ``info["final_obs"]`` is the bootstrap.
+    nothing is bootstrapped. After ``truncated`` the episode could have continued: bootstrap from
+    the value of ``info["final_obs"]``.
     """
 
     num_envs: int
@@ -38,7 +38,7 @@ class VecEnv(Protocol):
     action_dim: int
     """A, numbers in an action."""
     device: torch.device
-    """Device of all tensors but those of ``state_dict``, which are on the CPU."""
+    """Device of all tensors except those in ``state_dict``, which are on the CPU."""
 
     def reset(self) -> Tensor:
         """Restart all simulations; return observations (N, D) float32."""

@@ -15,8 +15,7 @@ from pgdm.library.published_masses import RATIOS
 if TYPE_CHECKING:
     from pgdm.sim.scene import HandCfg, PlacementCfg, SimCfg, TaskCfg
 
-# Contact priority with which the randomised geom's friction overrides the other geom's (released
-# code).
+# Contact priority by which the randomised geom's friction overrides the other's (released code).
 RANDOMIZED_PRIORITY = 10
 
 

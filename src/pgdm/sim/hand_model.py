@@ -185,7 +185,7 @@ def _check_couplings(model: mujoco.MjModel, hand: HandCfg, count: int) -> np.nda
             hand,
             f"joint '{_joint(model, couplings.followers[one])}' leaves its range by "
             f"{over[one]:.3f} when '{_joint(model, couplings.leaders[one])}' goes to the end of "
-            "its own: narrow the leader's range",
+            "its range: narrow the range of the latter",
         )
     return coupled
 
