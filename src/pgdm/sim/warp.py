@@ -204,9 +204,7 @@ class WarpBatch:
         size = self._geom("geom_size")
         self._geom("geom_friction")[rows] = torch.as_tensor(friction).float().to(self.device)
         size[rows, 0] = torch.as_tensor(half_width).float().to(self.device)
-        self._geom("geom_rbound")[rows] = torch.linalg.vector_norm(
-            size[rows], dim=-1
-        )  # bounding radius of a box
+        self._geom("geom_rbound")[rows] = torch.linalg.vector_norm(size[rows], dim=-1)  # of a box
         model, body, scratch = self._of_mass, self.scene.index.object_body, self._scratch
         inertia = self.scene.model.body_inertia[body] / self.scene.model.body_mass[body]
         for row, kg in zip(rows.tolist(), mass.tolist(), strict=True):
