@@ -182,7 +182,7 @@ def test_python_without_docstrings(library_home: Path) -> None:
         check=False,
     )
     assert done.returncode == 2
-    assert "error: Python runs with -OO" in done.stderr
+    assert "because Python runs with -OO" in done.stderr
     assert "Traceback" not in done.stderr
 
 
