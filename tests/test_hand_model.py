@@ -52,10 +52,14 @@ def servo(number: int) -> str:
 M7 = servo(7)
 BROKEN = {
     "no ctrlrange": (M7, M7.replace(' ctrlrange="-1 1"', ""), "'h/m7' has no ctrlrange"),
-    "torque motor": (M7, '<motor name="m" joint="h/f1" ctrlrange="-1 1"/>', "'m' is no position"),
-    "velocity": (M7, '<velocity name="m" joint="h/f1" ctrlrange="-1 1"/>', "'m' is no position"),
-    "filtered": (M7, M7.replace("kp=", 'timeconst=".1" kp='), "'h/m7' is no position"),
-    "gear": (M7, M7.replace("kp=", 'gear="2" kp='), "'h/m7' is no position"),
+    "torque motor": (
+        M7,
+        '<motor name="m" joint="h/f1" ctrlrange="-1 1"/>',
+        "'m' is not a position",
+    ),
+    "velocity": (M7, '<velocity name="m" joint="h/f1" ctrlrange="-1 1"/>', "'m' is not a position"),
+    "filtered": (M7, M7.replace("kp=", 'timeconst=".1" kp='), "'h/m7' is not a position"),
+    "gear": (M7, M7.replace("kp=", 'gear="2" kp='), "'h/m7' is not a position"),
     "tendon": (M7, M7.replace("joint=", "tendon=").replace("h/f1", "h/both"), "drives a tendon"),
     "passive": (M7, "", "joint 'h/f1' has no actuator"),
     "two": (M7, M7.replace("h/f1", "h/f0"), "joint 'h/f0' has a second actuator 'h/m7'"),
@@ -73,7 +77,7 @@ BROKEN = {
     "base coupled": (
         "<equality>",
         '<equality><joint joint1="h/f1" joint2="h/b3"/>',
-        "joint 'h/f1' follows 'h/b3', which must be a finger joint",
+        "joint 'h/f1' follows 'h/b3'; neither may be a base joint",
     ),
     "out of range": (
         "<equality>",
@@ -245,5 +249,5 @@ def test_a_run_with_a_wrong_hand_does_not_start(copied: Path) -> None:
     write(copied, text.replace(joint[0], f'<motor name="torque" joint="{joint[1]}"/>'))
     run = command("pgdm-run", "task=dmanus-crackerbox", "--offline", *TINY, "run_dir=run")
     assert run.code == 1 and len(run.errors) == 1
-    assert "actuator 'dmanus/torque' is no position servo" in run.errors[0]
+    assert "actuator 'dmanus/torque' is not a position servo" in run.errors[0]
     assert not Path("run/metrics.jsonl").exists()

@@ -72,10 +72,10 @@ def settings(**changes: Any) -> dict[str, Any]:
 METHOD = {**tiny().settings()["method"], "name": "evil_module:recipe"}
 GOOD = packed()
 BAD = {
-    "empty": (b"", "is no safetensors file"),
-    "text": (b"a policy, honestly", "is no safetensors file"),
+    "empty": (b"", "is not a safetensors file"),
+    "text": (b"a policy, honestly", "is not a safetensors file"),
     "cut off": (GOOD[:-10], "is damaged"),
-    "cut off in the header": (GOOD[:200], "is no safetensors file, or is cut off"),
+    "cut off in the header": (GOOD[:200], "is not a safetensors file, or is cut off"),
     "other people's": (save({"w": torch.zeros(1)}), "holds no policy of pgdm"),
     "no JSON": (save({"w": torch.zeros(1)}, {"pgdm": "{"}), "holds no policy of pgdm"),
     "a newer format": (packed(format="pgdm-policy-9"), "has format 'pgdm-policy-9'"),
@@ -173,13 +173,13 @@ def bomb(path: Path) -> bytes:
 
 RELU = {"activation_fn": "<class 'torch.nn.modules.activation.ReLU'>"}
 BAD_ZIPS: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "text": (lambda p: p.write_text("PK, honestly"), "is no zip of Stable-Baselines3"),
-    "cut off": (lambda p: p.write_bytes(zipped(p).read_bytes()[:-30]), "is no zip of"),
-    "no policy": (lambda p: zipfile.ZipFile(p, "w").close(), "is no zip of"),
+    "text": (lambda p: p.write_text("PK, honestly"), "is not a zip of Stable-Baselines3"),
+    "cut off": (lambda p: p.write_bytes(zipped(p).read_bytes()[:-30]), "is not a zip of"),
+    "no policy": (lambda p: zipfile.ZipFile(p, "w").close(), "is not a zip of"),
     "a bomb": (lambda p: zipped(p, raw=bytes(sb3.MOST_BYTES + 1)), "would unpack to"),
     "a bomb inside": (lambda p: zipped(p, raw=bomb(p)), "would unpack to"),
-    "a pickle": (lambda p: zipped(p, state={"log_std": Runs(p / "x")}), "no tensor or plain"),
-    "a list": (lambda p: zipped(p, state=[1]), "is no mapping of tensors"),
+    "a pickle": (lambda p: zipped(p, state={"log_std": Runs(p / "x")}), "not a tensor or plain"),
+    "a list": (lambda p: zipped(p, state=[1]), "is not a mapping of tensors"),
     "ReLU": (lambda p: zipped(p, policy_kwargs=RELU), "ReLU"),
     "gSDE": (lambda p: zipped(p, use_sde=True), "explores with gSDE"),
     "NaN": (lambda p: zipped(p, weights(log_std=torch.full((3,), torch.nan))), "not finite"),

@@ -342,7 +342,7 @@ def test_a_checkpoint_of_another_network_is_refused() -> None:
         other.load_state_dict(state)
     same = Trainer(PointEnv(), trainer_cfg())
     del state["frames"]
-    with pytest.raises(CheckpointError, match="it is no state of a run"):
+    with pytest.raises(CheckpointError, match="it is not the state of a run"):
         same.load_state_dict(state)
 
 

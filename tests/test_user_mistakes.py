@@ -83,7 +83,7 @@ MINE = Method({config}, {recipe})
             METHOD.format(
                 body="return replace(r, rewards=())", config="MethodCfg", recipe="extended"
             ),
-            "a recipe needs a reward and a termination at least",
+            "a recipe needs at least one reward and one termination",
         ),
         (
             METHOD.format(
@@ -182,7 +182,7 @@ def test_python_without_docstrings(library_home: Path) -> None:
         check=False,
     )
     assert done.returncode == 2
-    assert "error: Python runs with -OO" in done.stderr
+    assert "because Python runs with -OO" in done.stderr
     assert "Traceback" not in done.stderr
 
 
@@ -228,7 +228,7 @@ def test_actions_of_numpy_and_of_a_wrong_shape(library_home: Path) -> None:
         env.step(torch.zeros(env.action_dim))
     nothing: Any
     for nothing in (None, "x", np.full((2, 30), "x")):
-        with pytest.raises(ConfigError, match="the actions are no array of numbers"):
+        with pytest.raises(ConfigError, match="the actions are not an array of numbers"):
             env.step(nothing)
 
 
@@ -292,7 +292,7 @@ def test_a_forged_checkpoint_gives_way_to_the_one_before(
         longer = [*TINY, "run_dir=run", "total_frames=64", "checkpoint.interval_s=1e-9"]
         outcome = command("pgdm-run", "--offline", *longer)
     assert (outcome.code, outcome.errors) == (0, []), outcome.err
-    assert "resuming from the one before" in caplog.text + outcome.err
+    assert "trying the checkpoint before it" in caplog.text + outcome.err
     evaluated = command("pgdm", "eval", "run", "--offline")
     assert evaluated.code == 0, evaluated.err
 

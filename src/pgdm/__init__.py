@@ -20,7 +20,7 @@ __all__ = ["load_policy", "make_batch", "make_sb3", "make_torchrl"]
 
 
 def __getattr__(name: str) -> object:
-    # torch and the simulator load when an environment is asked for, not with every `import pgdm`.
+    # Import torch and the simulator on first use, not with every `import pgdm`.
     if name == "load_policy":
         from pgdm.runs.checkpoints import load_policy
 
@@ -32,6 +32,6 @@ def __getattr__(name: str) -> object:
     raise AttributeError(f"module 'pgdm' has no attribute '{name}'")
 
 
-# Gymnasium finds environments of packages that were imported; it asks for nothing by itself.
+# Gymnasium discovers no packages by itself: importing pgdm must register its environments.
 register()
 keep_old_names()

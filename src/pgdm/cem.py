@@ -22,14 +22,14 @@ class CemCfg:
     population: int
     """Samples per round."""
     elites: int
-    """Samples of a round that the next round is drawn around."""
+    """Number of lowest-cost samples to which a round fits the Gaussian."""
     smoothing: float = 0.0
     """Share of the old mean and standard deviation that a round keeps (0..1)."""
     least: float = 0.0
-    """Lower bound of the standard deviation, as a share of the first one: keeps the search from
-    freezing."""
+    """Lower bound of the standard deviation, as a share of the first one: keeps the Gaussian from
+    collapsing early."""
     added: float = 0.0
-    """Share of the first standard deviation added to that of the elites, for the same reason."""
+    """Share of the first standard deviation added in each round, for the same reason."""
 
 
 class CrossEntropy:
@@ -38,8 +38,8 @@ class CrossEntropy:
     Args:
         mean: mean of the first samples (D,).
         std: their standard deviation (D,).
-        cfg: how to search.
-        random: source of the samples.
+        cfg: settings of the search.
+        random: random stream of the samples.
     """
 
     def __init__(
@@ -55,9 +55,10 @@ class CrossEntropy:
         return self.mean + self.std * noise
 
     def tell(self, samples: np.ndarray, cost: np.ndarray) -> np.ndarray:
-        """Move to the best of samples (N, D) with costs (N,); return the elites' rows, best first.
+        """Refit the Gaussian to the best of samples (N, D) with costs (N,).
 
-        Samples of infinite cost are never elites, even if fewer than ``elites`` remain.
+        Returns the elites' indices, best first. Samples whose cost is not finite are never elites,
+        even if fewer than ``elites`` remain; without any elite the Gaussian stays as it is.
         """
         elites = np.argsort(cost, kind="stable")[: self._cfg.elites]
         elites = elites[np.isfinite(cost[elites])]

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Collection, Iterable, Sequence
 from numbers import Integral
 
-_FEW = 12  # up to this many valid names are all listed
+_FEW = 12  # a message lists at most this many valid names
 
 
 class PgdmError(Exception):
@@ -26,7 +26,7 @@ class UnknownNameError(ConfigError):
         name: the name that was not found.
         valid: the names that exist.
         hint: an additional sentence, such as a command that helps.
-        meant: names that are meant, if known; empty: those that look alike.
+        meant: names to suggest; if empty, those of similar spelling.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class UnknownNameError(ConfigError):
 
 
 def check_at_least(key: str, value: float, low: float) -> None:
-    """Check a number of the settings.
+    """Check a numeric setting.
 
     Raises:
         ConfigError: if it is less than ``low``.
@@ -60,10 +60,10 @@ def check_at_least(key: str, value: float, low: float) -> None:
 
 
 def check_count(key: str, value: object, low: int) -> None:
-    """Check a whole number that a caller from Python has given.
+    """Check an integer argument of the Python API.
 
     Raises:
-        ConfigError: if it is no whole number, or less than ``low``.
+        ConfigError: if it is not an integer, or less than ``low``.
     """
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise ConfigError(f"{key} is {value!r}; it must be a whole number, {low} or more")
@@ -71,7 +71,7 @@ def check_count(key: str, value: object, low: int) -> None:
 
 
 def check_above_zero(key: str, value: float) -> None:
-    """Check a number of the settings.
+    """Check a numeric setting.
 
     Raises:
         ConfigError: if it is 0 or less.
@@ -98,13 +98,13 @@ def check_interpreter() -> None:
     """
     if sys.flags.optimize > 1:
         raise ConfigError(
-            "Python runs with -OO or PYTHONOPTIMIZE=2, and torchrl cannot be imported then; "
-            "run it without"
+            "torchrl cannot be imported because Python runs with -OO or PYTHONOPTIMIZE=2; "
+            "run Python without them"
         )
 
 
 class LimitError(PgdmError):
-    """Work on a file takes more time or memory than it may."""
+    """Processing a file exceeded its limit of time or memory."""
 
 
 class LibraryError(PgdmError):

@@ -44,7 +44,7 @@ from pgdm.wrist.stored import WristPlans
 _log = logging.getLogger(__name__)
 
 _LONG_DAYS = 30
-"""A run that takes longer is announced."""
+"""Expected length of a run above which a note announces it, days."""
 
 
 def env_builder(
@@ -60,10 +60,10 @@ def env_builder(
     Args:
         cfg: the experiment.
         library: library with its assets.
-        notify: called with a sentence on what takes time or deviates from the settings.
+        notify: called with a sentence about each slow step or deviation from the settings.
         progress: called with the wrist planner's progress; None reports it to ``notify``.
-        plan_wrist: whether a wrist plan that is needed and missing is computed.
-        commands: of the wrist, (T-1, 6) m and rad, instead of a stored plan.
+        plan_wrist: whether to compute a wrist plan that is needed and missing.
+        commands: base commands to use instead of a stored wrist plan, (T-1, 6), m and rad.
 
     Raises:
         PgdmError: see `EnvBuilder` and `WristPlans`.
@@ -99,12 +99,14 @@ def wanted_start(cfg: ExperimentCfg, library: Library) -> Wanted:
 
 
 def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
-    """Return the notes of a run beforehand, as far as nothing has to be fetched or computed.
+    """Return the `notes` of a run before it starts.
+
+    If assets must be fetched or a start state computed first, return only a note about that.
 
     Raises:
         ConfigError: if its start state is missing and would not be computed, or there is no such
             hand.
-        SceneError: if the scene does not compile, or the hand is not what pgdm assumes.
+        SceneError: if the scene does not compile, or the hand violates pgdm's assumptions.
     """
     task = cfg.task.motion
     if holds_run(Path(cfg.run_dir), cfg.resume):
@@ -115,7 +117,7 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
         return [f"the run fetches the expert hand trajectory of '{task}' first"]
     start = wanted_start(cfg, library)
     if start.can_be_made and not start.path.is_file():
-        build_scene(library, cfg.task, cfg.hand, cfg.sim)  # what the run would fail at
+        build_scene(library, cfg.task, cfg.hand, cfg.sim)  # fail now, not in the run
         return [f"the run computes the '{cfg.pregrasp.source}' start of '{task}' first"]
     missing: list[str] = []
     builder = env_builder(cfg, library, missing.append, plan_wrist=False)
@@ -124,7 +126,7 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
 
 
 def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
-    """Return where a run deviates from its settings, and the disk space it takes, as sentences."""
+    """Return sentences on a run's deviations from its settings, long duration and disk space."""
     late, days = builder.mdp.recipe.unfinished(cfg.total_frames), cfg.usual_days
     return [
         *builder.notes,
@@ -180,7 +182,7 @@ def run_experiment(
         cfg: the experiment.
         callbacks: listeners, such as a progress bar.
         stop: polled at safe points; True saves the run and ends it as ``interrupted``.
-        notify: called with a sentence on what takes time or deviates from the settings.
+        notify: called with a sentence about each slow step or deviation from the settings.
 
     Raises:
         PgdmError: if the run cannot start, be resumed or be saved.
@@ -205,7 +207,7 @@ def run_experiment(
         if state is not None:
             check_assets(state["metadata"], builder, run_dir, notify)
         recorder = _recorder(cfg, builder, notify)
-        with restoring(run_dir / REPLAY):  # a start that is refused leaves no reserved disk space
+        with restoring(run_dir / REPLAY):  # if starting fails, free the reserved disk space
             trainer = _trainer(cfg, builder, checkpoints, (recorder, *callbacks), stop)
             if state is not None:
                 state = checkpoints.latest(trainer.load_state_dict)
@@ -221,7 +223,7 @@ def _has_finished(cfg: ExperimentCfg, builder: EnvBuilder, state: State, notify:
     run_dir = Path(cfg.run_dir)
     stored = read_json(run_dir / RESULT)
     if fault(stored, RESULT_KINDS):
-        return False  # it is written again
+        return False  # the result is missing or malformed: write it again
     whole = is_whole(stored, cfg.total_frames, cfg.time_limit_min)
     if not (whole and int(state["frames"]) >= stored["frames"]):
         return False

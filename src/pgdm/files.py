@@ -1,8 +1,8 @@
-"""Reading files that somebody else may have written: regular files only, of limited size and depth.
+"""Reading untrusted files: regular files only, of limited size and depth.
 
-Settings, runs, checkouts and motions are all read here. Otherwise a pipe or a device in place of a
-file would be read without end, and a few lines of YAML or JSON could fill the memory. Failures are
-of two kinds only: OSError if the file itself cannot be read, ValueError if its content is refused.
+Settings, run folders, checkouts and motions are all read with these functions. Without their
+checks, reading a pipe or device in place of a file might never end, and a few lines of YAML could
+fill the memory. OSError means that the file cannot be read, ValueError that its content is invalid.
 """
 
 from __future__ import annotations
@@ -43,16 +43,17 @@ MOST_BYTES = 1 << 30
 MOST_JSON_BYTES = 1 << 27
 MOST_TEXT_BYTES = 1 << 22
 MOST_DEPTH = 50
-"""Largest nesting of YAML, and of folders that are searched."""
+"""Deepest nesting of YAML, and of folders that are searched."""
 MOST_NODES = 100_000
-"""Largest number of values in a YAML file, those that aliases repeat counted each time."""
-# What torch raises for files of others; its own messages advise to switch the protection off.
+"""Largest number of values in a YAML file, counting those that aliases repeat each time."""
+# What torch.load raises for bad files; its messages, which advise turning `weights_only` off, are
+# replaced.
 _TORCH_ERRORS = (
     *(pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, TypeError),
     *(AttributeError, AssertionError, ArithmeticError, ImportError, MemoryError, OSError),
 )
 _LONG = re.compile(rb"\d{25}")
-_MOST_DIGITS = 20  # of a whole number; 64 bits have no more
+_MOST_DIGITS = 20  # digits of the largest 64-bit integer
 
 
 def walk(root: str | os.PathLike[str]) -> Iterator[tuple[str, list[str], list[str]]]:
@@ -68,7 +69,7 @@ def open_file(path: str | os.PathLike[str]) -> io.BufferedReader:
     """Open a regular file, or a link to one, for reading.
 
     Raises:
-        OSError: if there is none, or it is a folder, a pipe, a socket or a device.
+        OSError: if it does not exist, or is a folder, a pipe, a socket or a device.
     """
     # Without O_NONBLOCK, opening a pipe waits for a writer.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -98,7 +99,7 @@ def whole(file: io.BufferedReader, most: int = MOST_BYTES) -> bytes:
         OSError: as for ``read_bytes``.
     """
     size = os.fstat(file.fileno()).st_size
-    content = file.read(most + 1) if size <= most else b""  # it may grow meanwhile
+    content = file.read(most + 1) if size <= most else b""  # the file may be growing
     if max(size, len(content)) > most:
         reason = f"it has {size:,} bytes, more than the {most:,} allowed"
         raise OSError(errno.EFBIG, reason)
@@ -135,10 +136,10 @@ def parse_json(text: bytes) -> Any:
     """Return the value of a JSON text.
 
     Raises:
-        ValueError: if it is not JSON, is nested too deeply, or has a whole number above 64 bits.
+        ValueError: if it is not JSON, is nested too deeply, or has an integer of 25 digits or more.
     """
     try:
-        # The hook makes reading slower; most files have no long number.
+        # parse_int makes reading slower; most files have no long number.
         return json.loads(text, parse_int=_whole) if _LONG.search(text) else json.loads(text)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
@@ -161,10 +162,11 @@ def read_yaml(path: str | os.PathLike[str]) -> Any:
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the value of a YAML text, which creates plain values only; None if it is empty.
+    """Return the plain values of a YAML text; None if it is empty.
 
     Raises:
-        ValueError: if it is not YAML, or above ``MOST_DEPTH`` or ``MOST_NODES``; one line.
+        ValueError: if it is not YAML, or exceeds ``MOST_DEPTH`` or ``MOST_NODES``; the message is
+            one line.
     """
     try:
         return _Loader(text).get_single_data()
@@ -174,7 +176,7 @@ def parse_yaml(text: str) -> Any:
 
 
 class _Loader(Composer, _Parser, SafeConstructor, Resolver):  # type: ignore[misc]
-    """PyYAML's safe loader, which gives up on what is too deep or too long while it reads."""
+    """PyYAML's safe loader; stops as soon as a text is too deep or has too many values."""
 
     def __init__(self, text: str) -> None:
         _Parser.__init__(self, text)
@@ -182,10 +184,10 @@ class _Loader(Composer, _Parser, SafeConstructor, Resolver):  # type: ignore[mis
         SafeConstructor.__init__(self)
         Resolver.__init__(self)
         self._depth, self._nodes = 0, 0
-        self._sizes: dict[int, int] = {}  # of nodes with an anchor
+        self._sizes: dict[int, int] = {}  # values in each anchored node, by its id
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
-        """Compose a node as PyYAML does, and count."""
+        """Compose a node as PyYAML does, counting depth and values."""
         is_alias = self.check_event(yaml.AliasEvent)
         anchored = getattr(self.peek_event(), "anchor", None) is not None
         before = self._nodes
@@ -206,7 +208,7 @@ class _Loader(Composer, _Parser, SafeConstructor, Resolver):  # type: ignore[mis
         return node
 
     def construct_yaml_int(self, node: Any) -> int:
-        """Return a whole number; one above 64 bits is refused."""
+        """Return an integer; reject one of more than ``_MOST_DIGITS`` digits."""
         number = super().construct_yaml_int(node)
         if abs(number) >= 10**_MOST_DIGITS:
             raise yaml.YAMLError(f"the number {node.value[:12]}... has {len(node.value)} digits")
@@ -217,18 +219,18 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 def parse_tensors(content: bytes) -> Any:
-    """Return what ``torch.save`` wrote: tensors and plain values; nothing else is created.
+    """Return tensors and plain values that ``torch.save`` wrote; no other object is created.
 
     Raises:
-        ValueError: if it is damaged or holds anything else; one line.
+        ValueError: if it is damaged or holds anything else; the message is one line.
     """
     import torch
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they ask the reader to report torch's limits
+            warnings.simplefilter("ignore")  # about torch's limits, of no use here
             return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except _TORCH_ERRORS as error:
         found = re.search(r"GLOBAL [\w.]+", str(error))
-        reason = f"it holds {found[0]}, no tensor or plain value" if found else "it is damaged"
+        reason = f"it holds {found[0]}, not a tensor or plain value" if found else "it is damaged"
         raise ValueError(reason) from error

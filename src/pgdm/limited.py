@@ -1,7 +1,7 @@
-"""Work on files of other people in a child process, with limits of time and memory.
+"""Processing of untrusted files in a child process, with limits of time and memory.
 
-A mesh or a model can be valid and still ask for hours or for terabytes; neither MuJoCo nor a reader
-of meshes can be interrupted, and where memory ends, they end the process.
+A valid mesh or model may still take hours or terabytes to load. Neither MuJoCo nor the mesh readers
+can be interrupted, and they kill the process when memory runs out.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SECONDS = 10
 """CPU time for one call, s."""
 MEMORY = 4 << 30
 """Address space of the child, bytes."""
-_WALL_S = 120  # if it waits and computes nothing
+_WALL_S = 120  # wall-clock time granted beyond the CPU time, for a child that waits, s
 
 
 def each(
@@ -35,14 +35,14 @@ def each(
     """Call a function several times in one child process.
 
     Args:
-        function: of a module; arguments and results are pickled.
+        function: a module-level function; arguments and results are pickled.
         calls: the arguments of each call.
         seconds: CPU time for each call, s.
 
     Returns:
-        What each call returned or raised; a LimitError is the last one.
+        What each call returned or raised, in order; a LimitError ends the list.
     """
-    threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # each reserves memory
+    threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # each thread reserves memory
     path = os.pathsep.join(entry for entry in sys.path if entry)
     answers: list[R | Exception] = []
     with subprocess.Popen(
@@ -70,7 +70,7 @@ def call(function: Callable[..., R], *arguments: Any, seconds: int = SECONDS) ->
 
     Raises:
         LimitError: if it exceeds a limit.
-        Exception: what it raises.
+        Exception: whatever the function raises.
     """
     (answer,) = each(function, [arguments], seconds)
     if isinstance(answer, Exception):
@@ -95,7 +95,7 @@ def _answer(child: subprocess.Popen[bytes], stream: IO[bytes], seconds: int) -> 
 def _main(seconds: int, memory: int) -> None:
     """Answer the calls on stdin, each with its result or the exception."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print is no answer
+    os.dup2(2, 1)  # keep what libraries print out of the answers
     function, calls = pickle.load(sys.stdin.buffer)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))

@@ -39,13 +39,13 @@ def make_batch(
         task: task id, such as ``hammer-use1``.
         num_envs: N.
         num_threads: threads that step them; 0 takes one per core.
-        seed: seed of the per-reset variation, in tasks that have one.
+        seed: seed of the randomisation at each reset, in tasks that have it.
         auto_reset: whether rows restart automatically when their episode ends.
         offline: whether missing assets are an error instead of being fetched.
-        overrides: more settings, as on ``pgdm-run``'s command line. The env is one to train in: a
-            shaping (``["+experiment=fast"]`` has one) is part of its rewards.
-        choices: an option of a group by name: ``pregrasp="planned"``, ``obs="released"``,
-            ``action="absolute"``, ``method="pgdm"``, ``ablation="none"``.
+        overrides: more settings, as on ``pgdm-run``'s command line. Rewards are those of training,
+            including any shaping (``["+experiment=fast"]`` adds some).
+        choices: settings groups and their options, such as ``pregrasp="planned"``,
+            ``obs="released"``, ``action="absolute"``, ``method="pgdm"``, ``ablation="none"``.
 
     Returns:
         An env with ``reset() -> obs (N, D)`` and ``step(action (N, A)) -> obs, reward (N,),
@@ -61,7 +61,7 @@ def make_batch(
                 f"make_batch has no argument '{name}'; groups: {', '.join(_GROUPS)}, "
                 "other settings go into overrides=['key=value']"
             )
-    with deferred():  # as commands do
+    with deferred():  # these imports must not fail for lack of OpenGL
         from pgdm.config.compose import compose
         from pgdm.experiment import assets, env_builder
 
@@ -114,7 +114,7 @@ def register() -> None:
     try:
         tasks = available("task")
     except ConfigError as error:
-        _log.warning("the tasks are not known to Gymnasium: %s", error)
+        _log.warning("the tasks could not be registered with Gymnasium: %s", error)
         return
     for task in tasks:
         gymnasium.register(

@@ -1,4 +1,4 @@
-"""Free memory of this machine, and refusing what cannot fit into it."""
+"""Free memory of this machine, and a check that something fits into it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _CONTAINER = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_i
 
 
 def free_bytes() -> int:
-    """Return how much memory this process can still have, bytes."""
+    """Return an estimate of the memory this process can still allocate, bytes."""
     lines = Path("/proc/meminfo").read_text().splitlines()
     fields = dict(line.split(":", 1) for line in lines)
     free = [int(fields["MemAvailable"].split()[0]) * 1024]
@@ -26,11 +26,11 @@ def free_bytes() -> int:
 
 
 def check_fits(what: str, needed_bytes: float, cure: str) -> None:
-    """Check that something fits into the free memory; Linux would kill the process later.
+    """Check that something fits into the free memory, before Linux kills the process for it.
 
     Args:
-        what: what needs it, with the setting and its value.
-        needed_bytes: at least so many.
+        what: what needs the memory: the setting with its value.
+        needed_bytes: lower bound of the memory needed.
         cure: what to do if it does not fit.
 
     Raises:

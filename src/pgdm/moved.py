@@ -1,4 +1,4 @@
-"""Old names of moved modules: they import with a DeprecationWarning until the next version."""
+"""Old names of moved modules, importable with a DeprecationWarning until the next version."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class _Moved(MetaPathFinder, Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """Give the module its own spec back; it has run under its new name."""
+        """Restore the module's real spec; the import by its new name has executed it already."""
         assert module.__spec__ is not None
         module.__spec__ = module.__spec__.loader_state
 

@@ -14,7 +14,7 @@ TEMPORARY = ".tmp-"
 """Prefix of the names of unfinished files."""
 
 _NAME = re.compile(r"\w[\w.+-]{0,99}")
-"""The rule for everything that names a file or folder; it allows neither ``/`` nor ``..`` alone."""
+"""Valid names of files and folders; excludes ``/`` and names that start with a dot."""
 
 
 def home() -> Path:
@@ -55,12 +55,12 @@ def expanded(
 
     Args:
         path: as written.
-        shown: what precedes it in messages.
-        cure: what to do if there is no such home folder.
+        shown: text put before the path in messages.
+        cure: what to do if the home folder is unknown.
 
     Raises:
-        ConfigError: if there is none: many containers have neither ``HOME`` nor an entry for the
-            user.
+        ConfigError: if the home folder is unknown: many containers have neither ``HOME`` nor an
+            entry for the user.
     """
     try:
         return Path(path).expanduser().absolute()
@@ -105,16 +105,16 @@ def as_name(text: str) -> str:
 
 
 def inside(folder: Path, *names: str, kind: str = "name", suffix: str = "") -> Path:
-    """Join names to a folder: the one way from a name to a path.
+    """Join names to a folder after checking them: the way to turn any user's name into a path.
 
     Args:
         folder: the folder.
-        names: of folders, each in the one before, and at last of the file.
-        kind: what they stand for, for messages.
+        names: nested folders, outermost first, then the file.
+        kind: what the names stand for, for messages.
         suffix: appended to the last name, such as ``.npz``.
 
     Raises:
-        ConfigError: if one is not a valid name.
+        ConfigError: if a name is not valid.
     """
     for name in names:
         check_path_part(kind, name)
@@ -135,7 +135,7 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         OSError: if the file cannot be written; the old one is untouched.
     """
-    # With the same suffix, from which libraries infer the format.
+    # Keep the suffix: libraries infer the format from it.
     temp = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
     try:
         yield temp
@@ -149,9 +149,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def restoring(folder: Path) -> Iterator[None]:
-    """Undo what the block does in a folder if it fails: files it creates, or the folder itself.
+    """If the block fails, remove the files it created in a folder, and the folder if then empty.
 
-    Files that grew get their old length back.
+    Files that grew are cut to their old length.
     """
     before = {path: path.stat() for path in folder.glob("*")}
     try:

@@ -12,7 +12,7 @@ STOPPED = tuple(128 + number for number in _SIGNALS)
 
 
 class StopRequest:
-    """Within ``with``, a signal sets a flag that the trainer polls between iterations.
+    """Context manager in which a signal sets a flag that the trainer polls between iterations.
 
     Signals: Ctrl-C, SIGTERM, and SIGUSR2, which Slurm sends before a job's time is up. Outside the
     main thread Python allows no signal handlers; the flag then stays unset.
@@ -33,7 +33,7 @@ class StopRequest:
 
     @property
     def exit_code(self) -> int:
-        """The shell's exit code for this signal, one of ``STOPPED``."""
+        """The shell's exit code for the signal received (SIGINT's if none), one of ``STOPPED``."""
         return 128 + (self.signal or signal.SIGINT)
 
     def __enter__(self) -> StopRequest:

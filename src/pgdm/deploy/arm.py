@@ -22,23 +22,23 @@ _MOST_STEPS = 60
 _SETTLED_RAD = 1e-7
 _STARTS = 12
 Floats = tuple[float, ...]
-_COARSE = 8  # samples of a path by which starts are compared
+_COARSE = 8  # samples of a path on which start configurations are compared
 
 MOUNTS = {
-    # As in the package's scene of this arm with this hand: the palm is 13 mm above the flange.
+    # As in RoboHive's scene of this arm with this hand: the palm is 13 mm above the flange.
     "dmanus": (0.0, 0.0, -0.07825, 0.0, 0.0, -135.0),
-    # The rear end of the forearm's mesh, 0.213 m from its origin, on the flange.
+    # Puts the rear end of the forearm's mesh, 0.213 m from its origin, on the flange.
     "adroit": (0.0, 0.0, -0.213, 0.0, 0.0, 0.0),
 }
 """Default mounts by hand, see `Setup.mount`."""
 
 PLACES = {"dmanus": (0.2, -0.75, 90.0), "adroit": (0.2, -1.0, 90.0)}
-"""Default places of the arm by hand, see `Setup.arm_at`: the forearm of Adroit is long."""
+"""Default places of the arm by hand, see `Setup.arm_at`; Adroit's long forearm needs more room."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Where arm, hand and table are. World frame: that of the task, z = 0 on the table top."""
+    """Where arm, hand and table are, in the task's world frame: z = 0 on the table top."""
 
     arm_at: Floats = PLACES["dmanus"]
     """Arm's base: x and y, m, and turn about the vertical, degrees."""
@@ -63,7 +63,7 @@ class Setup:
     def of(
         cls, hand: str, arm_at: Floats | None, table_height_m: float, mount: Floats | None
     ) -> Setup:
-        """Return the setup of a hand, with its own place and mount if none are given.
+        """Return the setup of a hand; None for place or mount means the hand's default.
 
         Raises:
             ConfigError: if the hand has no defaults, or a number is not valid.
@@ -80,7 +80,7 @@ class Setup:
         """Check the numbers.
 
         Raises:
-            ConfigError: if one is not finite, or farther than 3 m away.
+            ConfigError: if a number is not finite, or a length is above 3 m.
         """
         lengths = (*self.arm_at[:2], self.table_height_m, *self.mount[:3])
         angles = (self.arm_at[2], *self.mount[3:])
@@ -92,7 +92,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class ArmPath:
-    """Arm joints along a path of the flange, and by how much they miss it."""
+    """Arm joints along a path of the flange, and the flange's errors."""
 
     joints: np.ndarray  # (K, 7) rad
     position_error_m: np.ndarray  # (K,)
@@ -104,7 +104,7 @@ class ArmIk:
 
     Args:
         file: MJCF of the arm, from `pgdm.library.arms.ensure_panda`.
-        setup: where it stands, and how the hand is mounted.
+        setup: where the arm stands, and how the hand is mounted.
     """
 
     def __init__(self, file: Path, setup: Setup) -> None:
@@ -124,15 +124,15 @@ class ArmIk:
         return pose.translation(), pose.rotation().wxyz
 
     def follow(self, pos: np.ndarray, quat: np.ndarray, seed: int = 0) -> ArmPath:
-        """Return joints along a path of the hand's mount body, continuous and within the limits.
+        """Return joints within the limits along a path of the hand's mount body.
 
-        Several postures are compared for the first pose, over the path as a whole: the one that
-        reaches most of it is taken, among equals that farthest from the limits.
+        The redundant arm can start in many configurations. Several are compared over the whole
+        path: the smallest error wins; among equals (to 1 mm), the distance from the limits decides.
 
         Args:
-            pos: (K, 3) m, world frame.
-            quat: (K, 4) wxyz.
-            seed: of the postures that are tried.
+            pos: positions (K, 3) m, world frame.
+            quat: orientations (K, 4) wxyz, world frame.
+            seed: seed of the random start configurations.
         """
         targets = [self._flange(p, q) for p, q in zip(pos, quat, strict=True)]
         coarse = targets[:: max(1, len(targets) // _COARSE)]
@@ -149,7 +149,7 @@ class ArmIk:
         return self._arm.inverse() @ mount @ self._mount.inverse()
 
     def _merit(self, path: ArmPath) -> tuple[float, float]:
-        """Return what makes a posture better: less error in steps of a millimetre, then room."""
+        """Return a path's merit: minus its largest error to 1 mm; room to limits less jumps."""
         low, high = POSITION_RAD.T
         room = float(np.minimum(path.joints - low, high - path.joints).min())
         miss = max(path.position_error_m.max(), 0.1 * path.rotation_error_rad.max())

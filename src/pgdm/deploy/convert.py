@@ -1,4 +1,4 @@
-"""From a rollout to a playback: commands are smoothed, the base becomes the arm's joints."""
+"""From a rollout to a playback: commands are smoothed, the arm's joints replace the base's."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class ConvertCfg:
 
     base: str = REACHED
     """``reached``: where the hand's base was at each step; ``commanded``: its targets (the paper).
-    The base of the simulation is a soft spring, the arm is not: targets that a policy exaggerates
-    to overcome the spring's lag are far from what the base does."""
+    The base follows its targets like a soft spring, the arm follows closely. A policy may
+    exaggerate targets to overcome the spring's lag; the arm would then move too far."""
     smooth_s: float = 0.04
-    """Standard deviation of the Gaussian that smooths commands, s: one control step."""
+    """Standard deviation of the Gaussian that smooths commands, s of the rollout."""
     hold_s: float = 1.0
     """How long the last command is held, s."""
     rate_hz: float = 100.0
-    """Samples a second."""
+    """Samples per second of the playback."""
     speed: float = 1.0
     """1: as fast as in simulation; 0.5: half as fast."""
 
@@ -53,7 +53,7 @@ class ConvertCfg:
 
 @dataclass(frozen=True)
 class Converted:
-    """A playback, and how well the arm can do it."""
+    """A playback, and how well the arm can follow it."""
 
     playback: Playback
     path: ArmPath
@@ -61,7 +61,7 @@ class Converted:
 
     @property
     def possible(self) -> bool:
-        """Whether the arm reaches the hand's base everywhere, within its limits."""
+        """Whether the arm can follow the hand's base everywhere, within the arm's limits."""
         return not self.usage.violations and self.unreached is None
 
     @property
@@ -85,17 +85,17 @@ def convert(
 ) -> Converted:
     """Convert a rollout.
 
-    Between two control steps the simulation holds a command. Here it becomes a smooth curve: the
-    piecewise constant command, which before the start is the hand's start pose and after the end
-    the last command, is averaged with a Gaussian.
+    The simulation holds a command for a control step. The playback has a smooth curve instead: the
+    piecewise constant commands, preceded by the hand's start pose and followed by the last command,
+    are convolved with a Gaussian of standard deviation ``cfg.smooth_s``.
 
     Args:
         rollout: the rollout.
         scene: the task's scene.
-        arm: the arm.
-        setup: where it stands.
-        cfg: how to convert.
-        facts: stored with the playback.
+        arm: inverse kinematics of the arm.
+        setup: where the arm stands.
+        cfg: settings of the conversion.
+        facts: plain values to store with the playback.
 
     Raises:
         ConfigError: if a number of the settings is outside its range.
@@ -123,7 +123,7 @@ def convert(
 
 
 def mount_pose(scene: Scene, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mount body's poses (K, 3) m and (K, 4) wxyz, world, of base joints (K, 6)."""
+    """Return the mount body's poses in the world, (K, 3) m and (K, 4) wxyz, at joints (K, 6)."""
     mount = Rotation.from_quat(scene.index.mount_quat, scalar_first=True)
     pos = scene.index.mount_pos + mount.apply(joints[:, :3])
     turn = (mount * Rotation.from_euler("XYZ", joints[:, 3:6])).as_quat(scalar_first=True)
@@ -145,7 +145,7 @@ def _curve(rollout: Rollout, values: np.ndarray, start: np.ndarray, cfg: Convert
 
 
 def _stride(cfg: ConvertCfg) -> int:
-    """Return how many cycles of the arm's control lie between two samples."""
+    """Return the number of the arm's control cycles between two samples."""
     return max(1, round(CONTROL_HZ / cfg.rate_hz))
 
 

@@ -1,4 +1,4 @@
-"""What the Franka Panda's joints may do, and where a trajectory does more."""
+"""Joint limits of the Franka Panda, and where a trajectory exceeds them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from scipy.interpolate import BSpline, make_interp_spline
 JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 """Names of the arm's joints, in the model and in playbacks."""
 
-# Panda, joints 1 to 7; the maker's documentation of the control parameters ("Necessary conditions
-# for joint trajectories"), the arm's model has the position limits from the same page.
+# Joints 1 to 7, from Franka's documentation of the control parameters ("Necessary conditions for
+# joint trajectories"), as are the position limits in the arm's model.
 POSITION_RAD = np.array(
     [
         [-2.8973, 2.8973],
@@ -30,7 +30,7 @@ TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])  # N m
 PAYLOAD_KG = 3.0
 
 CONTROL_HZ = 1000.0
-"""Rate at which the arm takes commands, and at which limits are checked."""
+"""Rate at which the arm takes commands and limits are checked."""
 _UNITS = {"velocity": "rad/s", "acceleration": "rad/s2", "jerk": "rad/s3"}
 
 
@@ -47,7 +47,7 @@ class Violation:
 
     @property
     def described(self) -> str:
-        """One sentence."""
+        """The violation as a sentence."""
         unit = _UNITS.get(self.quantity, "rad")
         return (
             f"{self.joint}: {self.quantity} {self.value:.4g} {unit} at {self.time_s:.3f} s, "
@@ -59,12 +59,16 @@ class Violation:
 class Usage:
     """How much of its limits a trajectory of the arm uses."""
 
-    share: dict[str, np.ndarray]  # (7,) of each quantity's limit; position: distance to it, rad
+    # By quantity, (7,): largest share of the limit; for ``position``, least distance to it, rad.
+    share: dict[str, np.ndarray]
     violations: list[Violation]
 
     @property
     def slower(self) -> float:
-        """The factor of speed, at most 1, at which velocity, acceleration and jerk are allowed."""
+        """Largest speed factor, at most 1, within the limits of velocity, acceleration and jerk.
+
+        With the largest shares v, a, j of these limits: min(1, 1/v, a^(-1/2), j^(-1/3)).
+        """
         roots = {"velocity": 1.0, "acceleration": 2.0, "jerk": 3.0}
         return min(1.0, *(float(self.share[k].max()) ** (-1 / n) for k, n in roots.items()))
 
@@ -72,7 +76,7 @@ class Usage:
 def smooth(time_s: np.ndarray, values: np.ndarray) -> BSpline:
     """Return the quintic spline through samples (K, n) at times (K,) that rests at both ends.
 
-    This is what lies between the samples of a playback: its limits are checked and it is played.
+    It defines a playback between its samples, for the check of the limits and for playing.
     """
     still = [(1, np.zeros(values.shape[1])), (2, np.zeros(values.shape[1]))]
     return make_interp_spline(time_s, values, k=5, bc_type=(still, still))

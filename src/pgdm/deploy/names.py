@@ -1,4 +1,4 @@
-"""Names in playbacks and options, checked before anything slow is loaded."""
+"""Names in playbacks and options, in a module that loads fast."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SUFFIXES = (".npz", ".csv")
 
 
 def check_suffix(path: Path) -> None:
-    """Check the ending of a playback's name.
+    """Check the suffix of a playback's file name.
 
     Raises:
         ConfigError: if it is neither ``.npz`` nor ``.csv``.
@@ -22,9 +22,9 @@ def check_suffix(path: Path) -> None:
 
 
 def check_base(name: str) -> None:
-    """Check which motion of the base is meant.
+    """Check a value of ``--base``.
 
     Raises:
-        UnknownNameError: if there is no such.
+        UnknownNameError: if it is not in ``BASES``.
     """
     check_name("--base", name, BASES)

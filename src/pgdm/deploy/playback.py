@@ -1,4 +1,4 @@
-"""A playback: what arm and hand are commanded over time, as a file that anybody can check."""
+"""Playbacks: commands of arm and hand over time, in files that are checked when read."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from pgdm.paths import replacing
 FORMAT = "pgdm-playback-1"
 MOST_SAMPLES = 100_000
 MOST_BYTES = 1 << 26
-_FEWEST = 6  # for a quintic spline
-_UNIT = 1e-3
+_FEWEST = 6  # samples that a quintic spline needs
+_UNIT = 1e-3  # tolerance of the norm of unit quaternions
 _MOST_RATE_HZ = 1000.0
 
 
 class PlaybackError(PgdmError):
-    """A playback file is damaged, or is none."""
+    """A file is damaged, or is not a playback."""
 
 
 @dataclass(frozen=True)
 class Playback:
-    """K samples. World frame: origin on the table top, z up; quaternions wxyz."""
+    """A playback of K samples. World frame: origin on the table top, z up; quaternions wxyz."""
 
     time_s: np.ndarray = field(repr=False)  # (K,) increasing from 0
     arm_joints_rad: np.ndarray = field(repr=False)  # (K, 7) commanded
@@ -45,11 +45,11 @@ class Playback:
     hand_joints: tuple[str, ...]
     """Names of the hand's joints, (h,), without the six base joints."""
     facts: dict[str, Any]
-    """Where it came from, and where arm, hand and table are; plain values."""
+    """Origin of the playback, and poses of arm, hand and table; plain values."""
 
     @property
     def duration_s(self) -> float:
-        """Length."""
+        """Length, s."""
         return float(self.time_s[-1])
 
 
@@ -68,7 +68,7 @@ def write(path: Path, playback: Playback) -> None:
     """Write a playback as ``.npz`` or ``.csv``, whole or not at all.
 
     Raises:
-        ConfigError: if the name ends in neither, or the file cannot be written.
+        ConfigError: if the name has another suffix, or the file cannot be written.
     """
     check_suffix(path)
     try:
@@ -85,7 +85,8 @@ def read(path: Path) -> Playback:
     """Read and check a playback; no code in the file is run.
 
     Raises:
-        PlaybackError: if it is missing, damaged or no playback; names the file and what is wrong.
+        ConfigError: if the name is neither ``.npz`` nor ``.csv``.
+        PlaybackError: if the file is missing, damaged or not a playback; the message says why.
     """
     check_suffix(path)
     try:
@@ -99,7 +100,7 @@ def read(path: Path) -> Playback:
         text = str(error)
         raise PlaybackError(text if str(path) in text else f"{path}: {text}") from error
     except (OSError, ValueError, RecursionError) as error:
-        raise PlaybackError(f"{path}: is no playback ({files.reason(error)})") from error
+        raise PlaybackError(f"{path}: is not a playback ({files.reason(error)})") from error
 
 
 def _as_arrays(playback: Playback) -> dict[str, np.ndarray]:
@@ -115,7 +116,7 @@ def _as_arrays(playback: Playback) -> dict[str, np.ndarray]:
 
 
 def _columns(arm_joints: tuple[str, ...], hand_joints: tuple[str, ...]) -> dict[str, list[str]]:
-    """Return the names of the columns of each array in a CSV."""
+    """Return the names of each array's columns in a CSV file."""
     names = {
         "time_s": ["time_s"],
         "arm_joints_rad": [f"{name}_rad" for name in arm_joints],
@@ -170,10 +171,10 @@ def _from_csv(text: str) -> dict[str, Any]:
 
 
 def _checked(arrays: Mapping[str, Any]) -> Playback:
-    """Return the playback in some arrays.
+    """Return the playback that arrays contain, once they are checked.
 
     Raises:
-        ValueError: if they are none.
+        ValueError: if they are not a valid playback.
     """
     wanted = ("format", "time_s", *_WIDTHS, "arm_joints", "hand_joints", "facts")
     if missing := [name for name in wanted if name not in arrays]:
@@ -204,25 +205,25 @@ def _checked(arrays: Mapping[str, Any]) -> Playback:
     }
     for key in ("base_quat", "object_quat"):
         if np.abs(np.linalg.norm(values[key], axis=1) - 1.0).max() > _UNIT:
-            raise ValueError(f"{key} has rows that are no unit quaternions")
+            raise ValueError(f"{key} has rows that are not unit quaternions")
     facts = files.parse_json(str(arrays["facts"]).encode())
     if not isinstance(facts, dict):
-        raise ValueError("its facts are no JSON object")
+        raise ValueError("its facts are not a JSON object")
     return Playback(time_s, **values, arm_joints=arm, hand_joints=hand, facts=facts)
 
 
 def _names(value: Any, key: str) -> tuple[str, ...]:
     if not isinstance(value, np.ndarray) or value.dtype.kind != "U" or value.ndim != 1:
-        raise ValueError(f"{key} is no list of names")
+        raise ValueError(f"{key} is not a list of names")
     names = tuple(str(name) for name in value)
     if len(set(names)) != len(names) or not all(name.isprintable() and name for name in names):
-        raise ValueError(f"{key} has a name that is empty, unprintable or there twice")
+        raise ValueError(f"{key} has a name that is empty, unprintable or given twice")
     return names
 
 
 def _numbers(value: Any, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-        raise ValueError(f"{key} is no array of numbers")
+        raise ValueError(f"{key} is not an array of numbers")
     fits = value.ndim == len(shape) and all(
         n in (None, m) for n, m in zip(shape, value.shape, strict=True)
     )

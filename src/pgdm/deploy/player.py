@@ -1,7 +1,7 @@
 """Playing a playback on a Franka arm over its control interface; an optional extra.
 
-The arm follows with the joint impedance controller of franky, a PD controller with the maker's
-compensation of gravity, as the paper's did. Only the arm moves: a hand has a driver of its own.
+The arm follows with the joint impedance controller of franky, a PD controller with Franka's gravity
+compensation, as in the paper. Only the arm is commanded: a hand needs its own driver.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from pgdm.errors import ConfigError, PgdmError
 
 MOST_LAG_RAD = 0.2
 """The arm is stopped if a joint is farther than this from its command."""
-STIFFNESS = np.array([600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0])  # N m/rad, maker's example
+STIFFNESS = np.array([600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0])  # N m/rad, Franka's example
 
 _PERIOD_S = 0.004
 _APPROACH = 0.1  # share of the arm's speed, acceleration and jerk on the way to the start
-_NEAR_RAD = 0.1  # farthest from the start at which the playback may begin
+_NEAR_RAD = 0.1  # largest distance of a joint from the start at which the playback may begin
 
 
 class RobotError(PgdmError):
@@ -35,17 +35,17 @@ class Played:
     """What the arm did."""
 
     time_s: float
-    """How far the playback came."""
+    """Time of the playback that was reached, s."""
     lag_rad: np.ndarray  # (7,) largest distance between command and joint
     whole: bool
-    """Whether it was played to its end."""
+    """Whether the playback was played to its end."""
 
 
 def check_playable(playback: Playback) -> None:
-    """Refuse what exceeds the limits of the arm.
+    """Check a playback against the limits of the arm.
 
     Raises:
-        ConfigError: names the worst violation.
+        ConfigError: if it exceeds a limit; the message names the first violation.
     """
     used = usage(playback.time_s, playback.arm_joints_rad)
     if used.violations:
@@ -60,7 +60,7 @@ class Player:
 
     Args:
         host: name or address of the arm's control unit.
-        realtime: whether the kernel of this computer must be a real-time one.
+        realtime: whether to require a real-time kernel on this computer.
 
     Raises:
         ConfigError: if franky is not installed.
@@ -78,16 +78,16 @@ class Player:
         wanted = franky.RealtimeConfig.Enforce if realtime else franky.RealtimeConfig.Ignore
         try:
             self._robot = franky.Robot(host, realtime_config=wanted)
-        except Exception as error:  # franky's have no common base
+        except Exception as error:  # franky's exceptions have no common base class
             raise RobotError(f"no arm answers at '{host}': {_line(error)}") from error
 
     @property
     def joints(self) -> np.ndarray:
-        """The arm's present joints, (7,) rad."""
+        """The arm's current joint positions, (7,) rad."""
         return np.array([float(q) for q in self._robot.current_joint_state.position])
 
     def approach(self, playback: Playback) -> None:
-        """Move slowly to the start of a playback, in a straight line of joints.
+        """Move slowly to the start of a playback, in a straight line in joint space.
 
         Raises:
             RobotError: if the arm refuses, or stops elsewhere.
@@ -110,17 +110,17 @@ class Player:
         stop: Callable[[], bool] = lambda: False,
         progress: Callable[[int, int], object] = lambda done, total: None,
     ) -> Played:
-        """Play a playback in real time, from its start, where the arm must be.
+        """Play a playback in real time; the arm must be at its start.
 
         Args:
             playback: the playback.
             stop: polled every 4 ms; True brings the arm to rest.
-            progress: called with hundredths of a second played, and their number.
+            progress: called with the hundredths of a second played, and the total.
 
         Raises:
-            ConfigError: if it exceeds the arm's limits.
-            RobotError: if the arm refuses, or lags behind by more than ``MOST_LAG_RAD``; it is then
-                brought to rest.
+            ConfigError: if the playback exceeds the arm's limits.
+            RobotError: if the arm refuses, or lags behind by more than ``MOST_LAG_RAD``; the arm is
+                then brought to rest.
         """
         check_playable(playback)
         path = smooth(playback.time_s, playback.arm_joints_rad)
@@ -160,7 +160,7 @@ class Player:
             return work()
         except PgdmError:
             raise
-        except Exception as error:  # franky's have no common base
+        except Exception as error:  # franky's exceptions have no common base class
             raise RobotError(f"the arm refused: {_line(error)}") from error
 
 

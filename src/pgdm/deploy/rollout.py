@@ -1,4 +1,4 @@
-"""Episodes of a policy with everything that a playback needs of them."""
+"""Episodes of a policy with all data that a playback needs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pgdm.rl.evaluate import Policy
 
 @dataclass(frozen=True)
 class Rollout:
-    """One episode."""
+    """One episode of T control steps."""
 
     commands: np.ndarray  # (T, nu) targets of the hand's joints at control steps, m and rad
     qpos: np.ndarray  # (T+1, nq) before each step and after the last
@@ -39,14 +39,14 @@ def roll_out(
         env: N simulations, ``auto_reset=False``.
         policy: the policy.
         generator: stream of the action noise; None: the mean action.
-        progress: called with the steps taken and their number.
+        progress: called with the steps taken and the total.
 
     Returns:
-        The episodes that lasted to the end of the motion, the best first: the one whose object
-        stayed closest to its targets.
+        The episodes that lasted to the end of the motion, sorted by mean object error, the best
+        first.
 
     Raises:
-        RunError: if none did.
+        RunError: if no episode did.
     """
     obs, total = env.reset(), len(env.mdp.reference) - 1
     states, commands = [env.sim.read()], []
@@ -62,7 +62,7 @@ def roll_out(
         ended = (terminated | truncated).numpy()
         if step < total - 1:
             alive &= ~ended
-        else:  # all end with the motion
+        else:  # the motion ends, and with it all episodes
             metrics = info["episodes"].metrics()
     whole = np.flatnonzero(alive)
     if not len(whole):

@@ -23,7 +23,7 @@ from pgdm.sim.batch import SimBatch
 from pgdm.sim.randomize import Randomizer
 from pgdm.sim.scene import HandCfg, Scene, SceneIndex, TaskCfg
 
-# Stiffness of the maker's own joint impedance controller, as in the maker's examples.
+# Stiffness of Franka's joint impedance controller in Franka's examples.
 STIFFNESS = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)  # N m/rad
 LIFTED_M = 0.02
 """Height above its start from which an object counts as lifted."""
@@ -34,19 +34,19 @@ _SCENE = "scene of arm and hand"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of K objects during a playback, at S instants."""
+    """Results of playing a playback on K objects, at S times."""
 
     time_s: np.ndarray  # (S,)
-    height_m: np.ndarray  # (S, K) of the centre of mass above its start
+    height_m: np.ndarray  # (S, K) of the centre of mass above its start; -inf once diverged
     expected_m: float
-    """Height that the rollout reached at its end."""
-    arm_error_rad: np.ndarray  # (7,) largest difference of command and joint over all
+    """Height of the object above its start at the end of the rollout, m."""
+    arm_error_rad: np.ndarray  # (7,) largest difference of command and joint in all simulations
     diverged: np.ndarray  # (K,) bool
     qpos: np.ndarray  # (S, nq) of the first simulation
 
     @property
     def held(self) -> np.ndarray:
-        """Which objects end at least half as high as expected, (K,) bool."""
+        """Which objects end lifted and at least half as high as expected, (K,) bool."""
         high = self.height_m[-1] >= 0.5 * self.expected_m
         return high & (self.height_m[-1] > LIFTED_M) & ~self.diverged
 
@@ -59,11 +59,11 @@ class Outcome:
 def arm_scene(library: Library, cfg: ExperimentCfg, arm_file: Path, setup: Setup) -> Scene:
     """Compile the scene of a run's task with the hand at the flange of the arm.
 
-    The arm's joints replace the six base joints. They and the fingers follow position commands; the
-    arm carries its own weight and that of the hand, as the maker's controller does.
+    The arm's joints replace the six base joints. They and the fingers follow position commands. The
+    arm compensates the weight of arm and hand, as Franka's controller does.
 
     Raises:
-        SceneError: if a file is damaged, or it does not compile.
+        SceneError: if a file is damaged, or the scene does not compile.
         LibraryError: if the library lacks an asset.
     """
     task, hand, source = cfg.task, cfg.hand, library.source_of(cfg.task.motion)
@@ -79,7 +79,7 @@ def arm_scene(library: Library, cfg: ExperimentCfg, arm_file: Path, setup: Setup
         actuator = spec.add_actuator(name=f"panda/{joint}", target=f"panda/{joint}")
         actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
         actuator.set_to_position(kp=stiffness, dampratio=1.0)
-        # Both would otherwise be the table scene's defaults.
+        # Otherwise both ranges would have the table scene's defaults.
         actuator.ctrllimited, actuator.ctrlrange = True, reach
         actuator.forcelimited, actuator.forcerange = True, [-torque, torque]
     pos, quat = setup.mount_pose()
@@ -148,7 +148,7 @@ def _index(
 
 
 def start_of(playback: Playback, scene: Scene, num_hand_joints: int) -> np.ndarray:
-    """Return the state (nq,) in which a playback begins: its first commands, the object at rest.
+    """Return the qpos (nq,) in which a playback begins: its first commands, the object at rest.
 
     Args:
         playback: the playback.
@@ -163,7 +163,7 @@ def start_of(playback: Playback, scene: Scene, num_hand_joints: int) -> np.ndarr
     width = num_hand_joints + scene.model.nq - scene.model.nu
     numbers = all(type(x) in (int, float) for x in stored)
     if not numbers or len(stored) != width or not np.isfinite(stored).all():
-        raise PlaybackError(f"its start_qpos is no list of {width} numbers, as this task needs")
+        raise PlaybackError(f"its start_qpos is not a list of {width} numbers, as this task needs")
     names = tuple(scene.model.joint(i).name.rpartition("/")[2] for i in range(scene.model.nu))
     if names[len(JOINTS) :] != playback.hand_joints:
         raise PlaybackError(
@@ -184,16 +184,16 @@ def simulate(
     threads: int,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Outcome:
-    """Play a playback open-loop on count objects, each drawn anew if the task is randomised.
+    """Play a playback open-loop in ``count`` simulations; a randomised object differs in each.
 
     Args:
         scene: from :func:`arm_scene`.
         playback: the playback.
-        start: state (nq,), from :func:`start_of`.
-        count: K.
-        seed: of the objects.
+        start: qpos (nq,), from :func:`start_of`.
+        count: K, number of simulations.
+        seed: seed of the objects' randomisation.
         threads: number of threads.
-        progress: called with the steps taken and their number.
+        progress: called with the steps taken and the total.
     """
     sim = SimBatch(scene, count, threads, _SUBSTEPS)
     every = np.arange(count)

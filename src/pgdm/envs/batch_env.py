@@ -47,10 +47,11 @@ class BatchEnv:
     Args:
         sim: the simulations.
         mdp: observations, actions, rewards, terminations, metrics, on the device of ``sim``.
-        randomize: per-reset variation of a simulation's contact, or None.
-        auto_reset: whether rows restart automatically when their episode ends; if not, stepping
-            them further is an error of the caller.
-        dump_dir: folder for the last states and targets of simulations that diverge, or None.
+        randomize: randomises the object at every reset, or None.
+        auto_reset: whether rows restart automatically when their episode ends; if not, the caller
+            must reset them before the next step.
+        dump_dir: folder for the last states and actuator targets of simulations that diverge, or
+            None.
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class BatchEnv:
         return self._obs
 
     def reach(self) -> Tensor:
-        """Restart all at the reset pose and carry out the reach; return observations (N, D) then.
+        """Restart all at the reset pose and carry out the reach; return the final obs (N, D).
 
         Raises:
             ConfigError: if no plan leads to the start state.
@@ -122,16 +123,17 @@ class BatchEnv:
         """Take one control step with actions (N, A) in [-1, 1], clipped to it.
 
         Returns:
-            obs (N, D) float32, for restarted rows that after the restart; reward (N,) float32;
+            obs (N, D) float32, for restarted rows the first after the restart; reward (N,) float32;
             terminated (N,) bool, the object was lost or the motion ended; truncated (N,) bool,
-            the simulation diverged; info with ``final_obs`` (N, D), ``qpos`` (N, nq),
-            ``object_error_m`` (N,), ``success`` (N,) bool, ``terms`` {name: (N,)} weighted
-            rewards, ``raw_terms`` unweighted, ``discount`` (N,), the factor on the future that a
-            shaping adds, or None, ``measures`` {name: (N,)}, NaN where they do not apply, ``ends``
-            {name: (N,) bool}, terminations, and ``episodes``, the `FinishedEpisodes`, or None.
+            the simulation diverged; info with ``final_obs`` (N, D), before any restart; ``qpos``
+            (N, nq); ``object_error_m`` (N,); ``success`` (N,) bool; ``terms`` {name: (N,)} weighted
+            rewards; ``raw_terms`` unweighted; ``discount`` (N,), the extra discount of shaping, or
+            None; ``measures`` {name: (N,)}, NaN where they do not apply; ``ends``
+            {name: (N,) bool}, terminations; and ``episodes``, the `FinishedEpisodes`, or None.
+            Diverged rows have reward 0 and, as ``final_obs``, their previous observation.
 
         Raises:
-            ConfigError: if the actions are no numbers, or have another shape.
+            ConfigError: if the actions are not numeric or have the wrong shape.
             RunError: without ``auto_reset``, if the motion is over in a simulation.
         """
         state, diverged = self._advance(self._checked(action))
@@ -178,9 +180,9 @@ class BatchEnv:
 
     def _checked(self, action: Tensor) -> Tensor:
         try:
-            action = torch.as_tensor(action)  # of NumPy too
+            action = torch.as_tensor(action)  # accepts NumPy arrays too
         except (TypeError, ValueError, RuntimeError) as error:
-            raise ConfigError(f"the actions are no array of numbers: {error}") from error
+            raise ConfigError(f"the actions are not an array of numbers: {error}") from error
         if action.shape != (self.num_envs, self.action_dim):
             raise ConfigError(
                 f"the actions have shape {tuple(action.shape)}; it must be (num_envs, action_dim), "
@@ -199,15 +201,15 @@ class BatchEnv:
             self._weights[self._names.index(name)] = weight
 
     def reward_weights(self) -> dict[str, float]:
-        """Return the present weight of each reward term."""
+        """Return the current weight of each reward term."""
         return dict(zip(self._names, self._weights[:, 0].tolist(), strict=True))
 
     def object_error(self) -> Tensor:
-        """Return the present object error, (N,) m."""
+        """Return the current object error, (N,) m."""
         return self._context(self.sim.read()).object_error
 
     def reseed(self, seed: int) -> None:
-        """Restart the random stream of the per-reset variation, if the task has one."""
+        """Reseed the randomisation at resets, if the task has it."""
         if self._randomize is not None:
             self._randomize.reseed(seed)
 
@@ -229,7 +231,7 @@ class BatchEnv:
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from ``state_dict``, bit-exact."""
+        """Continue from ``state_dict``, bit-exactly."""
         if self._randomize is not None:
             self._randomize.load_state_dict(state["randomize"], self.sim)
         self.sim.restore(state["rows"].numpy())
@@ -246,7 +248,7 @@ class BatchEnv:
         self._history.record(ctrl)
         diverged = torch.as_tensor(self.sim.step(ctrl))
         state = self.sim.read()
-        # A sum is finite only if all its parts are, and costs a tenth of checking each.
+        # A sum is finite only if all its terms are; it is ten times cheaper than checking each.
         sums = state.qpos.sum(1) + state.object_vel.sum(1)
         if not math.isfinite(float(sums.sum())):
             diverged |= ~torch.isfinite(sums)
@@ -254,7 +256,7 @@ class BatchEnv:
         return state, diverged
 
     def _restart(self, rows: Tensor, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Put simulations rows (k,) into a state and clear their sums."""
+        """Put simulations rows (k,) into a state and clear their episode sums."""
         if self._randomize is not None:
             self._randomize.apply(self.sim, rows)
         self.sim.reset(rows, qpos, qvel)
@@ -264,7 +266,7 @@ class BatchEnv:
     def _read_start(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the observation (D,) and the object's position (3,) and quaternion (4,) at reset.
 
-        They are the same after every reset: a ``Randomizer`` only varies contacts.
+        They are the same after every reset: a ``Randomizer`` does not change the pose.
         """
         one = self._all[:1]
         self.sim.reset(one, self.mdp.start.qpos, self.mdp.start.qvel)

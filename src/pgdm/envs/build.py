@@ -1,4 +1,4 @@
-"""From configuration and library to a batch env."""
+"""Building batch envs from settings and library."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ class EnvBuilder:
     Args:
         library: library with the task's assets.
         cfg: settings of the environment.
-        recipe: the method's.
-        plan: returns the wrist plan, if the action uses one; None if it is not computed yet: the
-            base then follows the clipped path.
+        recipe: recipe of the method.
+        plan: called for the wrist plan if the action uses one. If it returns None, because the plan
+            is not computed yet, the base follows the clipped path (`pgdm.wrist.path`).
 
     Raises:
         PgdmError: if the library lacks an asset, the scene does not compile, the start state is
@@ -113,7 +113,7 @@ class EnvBuilder:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences on how the environment deviates from its settings or its task from others."""
+        """Sentences on deviations from the settings, and on peculiarities of the task."""
         task, used = self.scene.task.id, self.mdp.start.source
         notes = []
         if self._cfg.sim.engine == WARP:
@@ -146,7 +146,7 @@ class EnvBuilder:
         if (beyond := self._expert_beyond_m()) > _FAR_M:
             notes.append(
                 f"the expert's hand of {task} leaves the robot's limits by up to {beyond:.2f} m; "
-                "methods follow it clipped to the limits, that far from the object"
+                "it is clipped to the limits, so methods follow a hand that is off by this much"
             )
         return notes
 
@@ -164,13 +164,13 @@ class EnvBuilder:
         )
 
     def _expert_beyond_m(self) -> float:
-        """Return how far the base of the expert's hand leaves its limits at most, m."""
+        """Return the largest distance by which the expert's base slides leave their ranges, m."""
         if self.expert is None or self.mdp.expert is None:
             return 0.0
         return float(np.abs(self.expert.qpos - self.mdp.expert.joints.numpy())[:, :3].max())
 
     def facts(self) -> dict[str, str]:
-        """Return what a result depends on besides configuration and program: sources and hashes."""
+        """Return what a result depends on besides settings and code: sources and hashes."""
         facts = {
             "asset_source": self.scene.asset_source,
             "motion_sha256": self.motion.sha256,
@@ -191,7 +191,7 @@ class EnvBuilder:
         return facts
 
     def differences(self, recorded: Mapping[str, Any]) -> Iterator[str]:
-        """Yield which recorded facts of a run differ from this environment's, as text."""
+        """Yield a text for each of a run's recorded facts that differs from this environment's."""
         for key, now in self.facts().items():
             if recorded.get(key) != now:
                 text = f"{key} '{recorded.get(key)}', and the library now has '{now}'"
@@ -218,13 +218,13 @@ class EnvBuilder:
     ) -> BatchEnv:
         """Return N simulations of the task; see `BatchEnv` for the arguments.
 
-        ``stream`` names the purpose of the simulations: each draws its own random numbers, and
-        only ``train`` has the shaping and the configured engine, on ``device``; all others are
-        simulated by C MuJoCo.
+        ``stream`` names the random stream and thereby the use of the simulations. Only ``train``
+        has the shaping and the configured engine, on ``device``; the simulations of all other
+        streams run in C MuJoCo.
 
         Raises:
-            ConfigError: if there are fewer than one simulation, they do not fit into the memory,
-                or the engine is not installed or cannot use the device.
+            ConfigError: if ``num_envs`` is below 1, the simulations do not fit into the memory, or
+                the engine is not installed or cannot use the device.
         """
         check_count("num_envs", num_envs, 1)
         check_count("num_threads", num_threads, 0)
@@ -255,14 +255,14 @@ class EnvBuilder:
 
     @cached_property
     def probe(self) -> BatchEnv:
-        """One simulation, for sizes."""
+        """An env with one simulation, to read sizes from."""
         return self.make(1, 1, stream=TRAIN if self._cfg.sim.engine != WARP else "probe")
 
     def check_memory(self, key: str, num_envs: int, others_bytes: float = 0.0) -> None:
-        """Check that so many simulations, and others_bytes besides, fit into the free memory.
+        """Check that ``num_envs`` simulations and ``others_bytes`` fit into the free memory.
 
         Raises:
-            ConfigError: if they do not; names the key.
+            ConfigError: if they do not; the message names ``key``, the setting to reduce.
         """
         on_device = key == "num_envs" and self._cfg.sim.engine == WARP
         each = 0 if on_device else self.probe.sim.bytes_each
@@ -271,7 +271,7 @@ class EnvBuilder:
 
 
 def _moved(value: Any, device: torch.device) -> Any:
-    """Return a dataclass, or None, with all its tensors on a device."""
+    """Return a tensor, or a dataclass with all its tensors, on a device; other values unchanged."""
     if isinstance(value, torch.Tensor):
         return value.to(device)
     if not is_dataclass(value) or isinstance(value, type):

@@ -1,4 +1,4 @@
-"""Keeps the last states and targets of all simulations, and dumps those that diverge."""
+"""Records the last states and actuator targets of simulations, to dump them on divergence."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_DUMPS = 20  # so that a broken scene does not fill the disk
 
 
 class History:
-    """A ring of the last ``KEPT_STEPS`` states and targets of all simulations.
+    """A ring buffer of the last ``KEPT_STEPS`` states and actuator targets of all simulations.
 
     Args:
         sim: the simulations.
@@ -36,7 +36,7 @@ class History:
         self._count = 0
 
     def record(self, ctrl: Array) -> None:
-        """Keep the present states, and the targets (N, nu) about to be applied to them."""
+        """Keep the current states, and the targets (N, nu) about to be applied to them."""
         if self._folder is None:
             return
         slot = self._count % KEPT_STEPS
@@ -48,8 +48,8 @@ class History:
         """Write the last states and targets of simulations to one file each, oldest first.
 
         Args:
-            sims: which simulations.
-            steps: their control steps since reset, so that no earlier episode is included.
+            sims: indices of the simulations.
+            steps: their control steps since reset; states of earlier episodes are left out.
         """
         _log.warning("%d simulation(s) diverged in '%s'", len(sims), self._sim.scene.task.id)
         if self._folder is None:
@@ -69,7 +69,7 @@ class History:
                 content |= {name: values[sim] for name, values in varied}
             path = self._folder / f"{time.time_ns()}-sim{sim}.npz"
             np.savez(path, task=np.array(self._sim.scene.task.id), **content)
-            _log.warning("its last %d states and targets: %s", len(order), path)
+            _log.warning("last %d states and targets written to %s", len(order), path)
 
 
 def replay(path: Path, sim: SimBatch) -> np.ndarray:
@@ -80,12 +80,12 @@ def replay(path: Path, sim: SimBatch) -> np.ndarray:
         sim: one simulation of the same scene.
 
     Returns:
-        The states after each step, (K, nstate); at the last one it diverged.
+        The states after each step, (K, nstate); the simulation diverged in the last step.
     """
     with np.load(path) as dump:
         stored = dict(dump)
     if "friction" in stored:
-        mass = stored.get("mass", sim.variation()[2][0])  # earlier versions did not vary it
+        mass = stored.get("mass", sim.variation()[2][0])  # earlier versions did not randomise it
         drawn = (stored["friction"], stored["half_width"], mass)
         sim.set_variation(np.array([0]), *(np.array([value]) for value in drawn))
     sim.restore(stored["states"][:1])

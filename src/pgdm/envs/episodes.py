@@ -1,4 +1,4 @@
-"""Episodes of a batch: what is summed up while they run, and their metrics when they finish."""
+"""Episodes of a batch: sums while they run, and metrics when they finish."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from pgdm.sim.batch import SimState
 class FinishedEpisodes:
     """k finished episodes of one task.
 
-    Metrics are computed on demand: for many episodes in one call it costs as much as for one.
+    Metrics are computed on demand; one call for many episodes costs about as much as for one.
     """
 
     reference: ObjectReference
     recipe: Recipe
     episodes: Episodes
-    sums: Tensor  # (2, K, k) of each reward term over the episode: weighted, then raw
-    measured: Tensor  # (2, M, k) of each measure: sum over the steps it applies to, their number
+    sums: Tensor  # (2, K, k) sum of each reward term over the episode: weighted, then raw
+    measured: Tensor  # (2, M, k) sum of each measure over the steps where it applies, their number
     flags: Tensor  # (1 + E, k) bool: diverged, then each of the recipe's ends
 
     def metrics(self) -> dict[str, Tensor]:
         """Return each metric's values, (k,) float64; see `pgdm.mdp.metrics.episode_metrics`.
 
-        In addition: ``return``, the sum of the task's own rewards; ``shaping``, the sum of those
-        that shaping adds, if any; ``diverged`` and ``end/<name>``, 0 or 1; the mean of each
+        In addition: ``return``, the sum of the rewards without shaping; ``shaping``, the sum of
+        those that shaping adds, if any; ``diverged`` and ``end/<name>``, 0 or 1; the mean of each
         measure under its name, NaN if it never applied; and the sum of each reward term over the
         episode, ``term/<name>`` weighted and ``raw/<name>`` unweighted.
         """
@@ -52,7 +52,7 @@ class FinishedEpisodes:
         return metrics | dict(zip(names, total / steps, strict=True))  # no step: 0/0 is NaN
 
     def with_later(self, later: Sequence[FinishedEpisodes]) -> FinishedEpisodes:
-        """Return these and later episodes of the same task as one, in this order."""
+        """Return one object with these and then later episodes of the same task."""
         every = (self, *later)
         return FinishedEpisodes(
             self.reference,
@@ -69,7 +69,7 @@ class FinishedEpisodes:
 
 
 class RunningEpisodes:
-    """Object poses, reward terms and measures of the episodes that N simulations are in.
+    """Object poses, reward terms and measures of the running episodes of N simulations.
 
     Args:
         num_envs: N.
@@ -100,7 +100,7 @@ class RunningEpisodes:
         self._measured[:, :, rows] = 0.0
 
     def place(self, rows: Tensor, pos: Tensor, quat: Tensor) -> None:
-        """Set the object's pose at reset, of rows (k,)."""
+        """Set the object's pose at reset in rows (k,): positions (k, 3), quaternions (k, 4)."""
         self._pos[rows, 0], self._quat[rows, 0] = pos, quat
 
     def add(self, terms: Tensor, raw: Tensor, measures: dict[str, Tensor]) -> None:
@@ -111,7 +111,7 @@ class RunningEpisodes:
             self._measured += torch.stack((values.nan_to_num(0.0), (~values.isnan()).double()))
 
     def follow(self, t: Tensor, state: SimState, diverged: Tensor | None) -> None:
-        """Keep the object's poses at steps t (N,); diverged rows keep those of the step before."""
+        """Record the object's poses at steps t (N,); diverged rows repeat the step before."""
         pos, quat = state.object_pos, state.object_quat
         if diverged is not None:
             before, keep = (self._rows, t - 1), diverged[:, None]
@@ -133,7 +133,7 @@ class RunningEpisodes:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that later metrics depend on."""
+        """Return everything that the metrics of running episodes depend on."""
         state = {"term_sums": self._sums, "pos": self._pos, "quat": self._quat}
         state |= {"measured": self._measured} if self._recipe.measures else {}
         return {name: value.cpu().clone() for name, value in state.items()}

@@ -1,4 +1,4 @@
-"""Videos: a policy at work, and given states of a scene."""
+"""Videos of a policy's episode and of given states of a scene."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ Act = Callable[[Tensor], Tensor]
 
 
 def film_policy(env: BatchEnv, act: Act, path: Path) -> Path:
-    """Write an MP4 of one episode; return its poster.
+    """Write an MP4 of one episode; return the path of its poster image.
 
     Args:
-        env: one simulation, ``auto_reset=False``.
+        env: one simulation, with ``auto_reset=False``.
         act: observations (1, D) -> actions (1, A).
         path: path of the MP4.
 
@@ -51,11 +51,11 @@ def film_policy(env: BatchEnv, act: Act, path: Path) -> Path:
 
 @dataclass(frozen=True)
 class Clip:
-    """States of a task's scene at the control steps, to be shown one a frame."""
+    """States of a task's scene at the control steps, to be shown one per frame."""
 
     scene: Scene
     reference: ObjectReference
-    """The object's motion, which the picture covers."""
+    """The exemplar motion, which the camera keeps in view."""
     qpos: np.ndarray  # (K, nq)
     captions: Sequence[str]
     """Text of each frame, (K,)."""
@@ -69,13 +69,13 @@ class Clip:
 
 
 def film_clip(clip: Clip, fps: int, path: Path, progress: StepProgress = silent) -> Path:
-    """Write an MP4 of a clip; return its poster.
+    """Write an MP4 of a clip; return the path of its poster image.
 
     Args:
         clip: what to show.
-        fps: frames a second.
+        fps: frames per second.
         path: path of the MP4.
-        progress: reports the frames drawn.
+        progress: called with the number of frames drawn.
 
     Raises:
         RenderError: if no OpenGL works here or the file cannot be written.
@@ -92,7 +92,7 @@ def film_clip(clip: Clip, fps: int, path: Path, progress: StepProgress = silent)
 
 
 def _drawn(clip: Clip) -> Iterator[np.ndarray]:
-    """Yield the pictures of a clip, drawn by another process: no driver may end a run."""
+    """Yield the pictures of a clip, drawn in a child process: a driver crash must not end a run."""
     scene, reference, steps = clip.scene, clip.reference, np.arange(len(clip.qpos))
     shots = Shots(
         scene.model,
@@ -113,5 +113,5 @@ def renderer(scene: Scene, reference: ObjectReference) -> Renderer:
 
 
 def goal(reference: ObjectReference, t: int | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the target position (3,) m and orientation (4,) wxyz at step t, or at steps (K,)."""
+    """Return target position (3,) m and orientation (4,) wxyz at step t; for steps (K,), K rows."""
     return reference.pos[t].numpy(), reference.quat[t].numpy()

@@ -35,7 +35,7 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         RenderError: if the mode is ``human`` and no window can be opened.
     """
 
-    # The frame rate of most tasks; __init__ sets that of hammer-strike.
+    # The frame rate of most tasks; __init__ sets that of the given task.
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 25}  # noqa: RUF012 (Gymnasium's form)
 
     def __init__(self, batch: BatchEnv, render_mode: str | None = None) -> None:
@@ -67,7 +67,7 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Restart the episode.
 
         Args:
-            seed: seed of the per-reset variation, in tasks that have one.
+            seed: seed of the randomisation at resets, in tasks that have it.
             options: ``{"reach": True}`` starts at the reset pose and carries out the reach, as in
                 deployment; the episode starts where the reach ends.
 
@@ -103,7 +103,7 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def render(self) -> np.ndarray | None:
         """Return the current picture, (H, W, 3) uint8, the target drawn as a translucent object.
 
-        None unless the mode is ``rgb_array``; a window is brought up to date by every step.
+        None unless the mode is ``rgb_array``; a window is updated by every step.
         """
         if self.render_mode != "rgb_array":
             return None

@@ -1,4 +1,4 @@
-"""The Stable-Baselines3 interface: N simulations as one of its vectorised environments."""
+"""The Stable-Baselines3 interface: N simulations as one ``VecEnv``."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class PgdmVecEnv(VecEnv):
         return self.batch.reset().numpy().copy()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take actions (N, A) for the next ``step_wait``."""
+        """Store actions (N, A) for the next ``step_wait``."""
         self._action = torch.as_tensor(np.asarray(actions, np.float32))
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
@@ -88,5 +88,5 @@ class PgdmVecEnv(VecEnv):
         return [result] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type, indices: Rows = None) -> list[bool]:
-        """Return False for each row: episodes are recorded here as ``Monitor`` would."""
+        """Return False for each row; ``infos`` hold episodes as SB3's ``Monitor`` would."""
         return [False] * len(list(self._get_indices(indices)))

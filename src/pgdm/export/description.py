@@ -1,4 +1,4 @@
-"""What a policy expects and what its actions mean, as plain values that go with its weights."""
+"""What a policy expects and what its actions mean, as plain values stored with its weights."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def card(policy: TrainedPolicy) -> dict[str, Any]:
 
 
 def description(policy: TrainedPolicy, builder: EnvBuilder) -> dict[str, Any]:
-    """Return the card of a policy, and all that runs it without pgdm.
+    """Return a policy's `card`, and everything needed to run it without pgdm.
 
     Positions are in the world frame; m, rad, s; quaternions wxyz. ``T`` is the number of poses of
     the exemplar motion, ``t`` the control steps since reset.
@@ -38,14 +38,14 @@ def description(policy: TrainedPolicy, builder: EnvBuilder) -> dict[str, Any]:
       ``of``, the joints, geoms or bodies that it describes;
     - ``observation_by_step``: (T, K) the last K numbers of the observation at each t;
     - ``points``, ``object``: geoms of the hand's points, and the tracked body;
-    - ``action``: of the hand's driven ``joints``, in [-1, 1]; ``target = middle + half * action``
-      (m, rad), but for the first ``len(low)`` joints, if there is a ``wrist``:
+    - ``action``: for the hand's driven ``joints``, in [-1, 1]; ``target = middle + half * action``
+      (m, rad). If there is a ``wrist``, the targets of the first ``len(low)`` joints are instead
       ``clip(path[min(t + lead_steps, T-1)] + largest * action, low, high)``;
     - ``actuators``: names, in the order of MuJoCo's ``ctrl``;
     - ``control``: physics steps of ``timestep_s`` per control step, and how many joints, first in
       ``qvel``, get ``qfrc_bias`` as applied force at the start of each control step;
-    - ``start``: where episodes start; ``episode``: the exemplar motion, when a step is a success,
-      when the object is lost.
+    - ``start``: the start state; ``episode``: the exemplar motion, and the object errors up to
+      which a step is a success and from which the object is lost.
     """
     scene, mdp = builder.scene, builder.mdp
     index, model = scene.index, scene.model
@@ -86,7 +86,7 @@ _Part = tuple[str, int, str, Sequence[str]]
 
 
 def _parts(layout: str, builder: EnvBuilder, joints: list[str]) -> list[_Part]:
-    """Return name, size, unit and subjects of each part of an observation, in order."""
+    """Return name, size, unit, and the joints, geoms or bodies of each part of an observation."""
     index, model = builder.scene.index, builder.scene.model
     tracked = model.body(index.object_body).name
     points = [model.geom(i).name for i in index.point_geoms]

@@ -1,4 +1,4 @@
-"""Episodes of a policy as a Minari dataset, for learning from stored data."""
+"""Episodes of a policy as a Minari dataset, such as for offline learning."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class EpisodesRequest:
     """Which episodes to write."""
 
     episodes: int
-    """How many."""
+    """Number of episodes."""
     deterministic: bool
     """Whether to take the policy's mean action instead of samples."""
     seed: int
-    """Of the action noise and the task's own randomness."""
+    """Seed of the action noise and of the object's randomisation."""
 
 
 def dataset_id(policy: TrainedPolicy) -> str:
@@ -52,18 +52,18 @@ def write_episodes(
     progress: StepProgress,
     stop: Callable[[], bool],
 ) -> str | None:
-    """Run episodes and write them as a dataset in a folder of Minari; return its name.
+    """Run episodes and write them as a Minari dataset; return its name, or None if stopped.
 
-    Observations (T, D) and actions (T-1, A) float32, as policy and environment see them; rewards of
-    the task, without those that are added while learning. ``infos`` hold ``object_error_m`` and
-    ``success``. The dataset appears complete or not at all.
+    An episode of L steps has observations (L+1, D) and clipped actions (L, A), both float32, and
+    the task's rewards without shaping. ``infos`` hold ``object_error_m`` and ``success``. The
+    dataset appears complete or not at all.
 
     Args:
         policy: the policy.
-        builder: its task.
+        builder: builder of the policy's task.
         request: which episodes.
-        folder: of datasets; what ``MINARI_DATASETS_PATH`` is set to, to load them.
-        progress: called with the episodes written.
+        folder: folder of datasets; set ``MINARI_DATASETS_PATH`` to it to load them.
+        progress: called with the episodes finished.
         stop: polled before each step; True ends without a dataset.
 
     Raises:
@@ -134,7 +134,7 @@ def _episode(
 def _store(
     buffers: list[Any], policy: TrainedPolicy, env: BatchEnv, name: str, folder: Path
 ) -> None:
-    """Write a dataset beside its place, then move it there."""
+    """Write a dataset to a temporary folder, then move it to its place."""
     import minari
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -143,7 +143,7 @@ def _store(
     os.environ[_FOLDER] = str(temp)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # which fields of the metadata are empty
+            warnings.simplefilter("ignore")  # about empty fields of the metadata
             minari.create_dataset_from_buffers(
                 name,
                 buffers,

@@ -12,10 +12,10 @@ def check_installed(what: str, *packages: str) -> None:
 
     Args:
         what: what needs them, for the message.
-        packages: as they are imported.
+        packages: their import names.
 
     Raises:
-        ConfigError: if one is not.
+        ConfigError: if a package is missing.
     """
     for package in packages:
         if find_spec(package) is None:

@@ -20,16 +20,16 @@ from pgdm.export.description import description
 from pgdm.export.trained import TrainedPolicy
 
 KEY = "pgdm"
-"""Where a file has its description, as JSON: of ONNX's metadata, of TorchScript's extra files."""
+"""Key of the JSON description in ONNX's metadata and among TorchScript's extra files."""
 INPUTS, OUTPUTS = ("observation", "step"), ("action", "ctrl")
 
 
 class PolicyGraph(nn.Module):
-    """A policy with its standardisation and its action map.
+    """A policy with its observation standardisation and action map.
 
     Args:
         policy: the policy.
-        builder: its task.
+        builder: builder of the policy's task.
     """
 
     inverse: Tensor
@@ -37,11 +37,11 @@ class PolicyGraph(nn.Module):
     def __init__(self, policy: TrainedPolicy, builder: EnvBuilder) -> None:
         super().__init__()
         self.network, self.actions = policy.network, builder.mdp.actions
-        order = np.argsort(builder.scene.index.actuators)  # actuator -> joint
+        order = np.argsort(builder.scene.index.actuators)  # by actuator: its driven joint
         self.register_buffer("inverse", torch.from_numpy(order))
 
     def forward(self, observation: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean action and what it makes the actuators do.
+        """Return the mean action and its actuator targets.
 
         Args:
             observation: (N, D) float32.
@@ -60,7 +60,7 @@ def _examples(graph: PolicyGraph) -> tuple[Tensor, Tensor]:
 
 
 def write_torchscript(policy: TrainedPolicy, builder: EnvBuilder, path: Path) -> None:
-    """Write a TorchScript module with the method of `PolicyGraph`, atomically.
+    """Write `PolicyGraph` as a TorchScript module, atomically.
 
     ``torch.jit.load(path, _extra_files={"pgdm": ""})`` reads it.
 
@@ -101,7 +101,7 @@ def write_onnx(policy: TrainedPolicy, builder: EnvBuilder, path: Path) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Leave out what torch says about its own exporters."""
+    """Silence torch's warnings about its exporters."""
     exporter = logging.getLogger("torch.onnx")
     before = exporter.level
     exporter.setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""Evaluating a trained policy as its training would."""
+"""Evaluation of a trained policy, as during its training."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ def measure(
     """Return a policy's metrics, see `Evaluator.evaluate`; None if it was stopped.
 
     Args:
-        policy: the policy; its ``cfg.seed`` is that of the noise.
-        builder: its task.
+        policy: the policy; its ``cfg.seed`` seeds the action noise.
+        builder: builder of the policy's task.
         progress: called with the control steps done.
-        stop: polled before each step.
-        episodes: of the sampled policy; None: as in the evaluations of its training.
-        deterministic: whether only the deterministic policy matters.
+        stop: polled before each step; True stops.
+        episodes: number of sampled episodes; None: as in the evaluations during training.
+        deterministic: whether only the deterministic metrics are needed.
     """
     cfg = policy.cfg
     count, wanted = threads(cfg), episodes or cfg.eval.episodes
     evaluator = Evaluator(
         lambda n: builder.make(n, min(n, count), cfg.seed, "eval"),
-        # The evaluator always runs the sampled policy too: once is enough where it is not shown.
+        # The evaluator always samples too; one episode is enough if that is not needed.
         1 if deterministic else wanted,
         wanted if cfg.task.randomize else 1,
         cfg.seed,

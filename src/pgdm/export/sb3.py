@@ -1,9 +1,9 @@
 """Policies of Stable-Baselines3's PPO, read from its zip files without running code from them.
 
-``policy.pth`` is read by torch's loader for weights only. Of ``data``, a JSON text, only the plain
-values are used: its pickled ones are never decoded. A ``VecNormalize`` file is a pickle: it is read
-with stand-ins for all of its classes (`pgdm.library.files.pickles`), so that the package need not
-be installed.
+``policy.pth`` is read with torch's ``weights_only``. Of ``data``, a JSON text, only the plain
+values are used: its pickled values are never decoded. A ``VecNormalize`` file is a pickle: it is
+read with stand-ins for all of its classes (`pgdm.library.files.pickles`), so that
+Stable-Baselines3 need not be installed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pgdm.rl.networks import ActorCritic, SquashedPolicy
 from pgdm.rl.normalizer import EPS
 
 MOST_BYTES = 1 << 26
-"""Largest member of a zip that is read, bytes; the released architecture has 0.4 MB."""
+"""Largest member of a zip that is read, bytes; a policy of the paper's architecture has 0.4 MB."""
 _PACKAGES = ("stable_baselines3", "gymnasium", "gym", "numpy", "collections")
 """Packages whose objects a ``VecNormalize`` file may hold."""
 _LAYER = re.compile(r"mlp_extractor\.policy_net\.(\d+)\.weight")
@@ -43,10 +43,10 @@ def read(
     """Return the policy of a zip file.
 
     Args:
-        path: written by ``PPO.save``.
-        task: the task it was trained on.
+        path: file written by ``PPO.save``.
+        task: task that the policy was trained on.
         overrides: settings of that training which differ from the paper's.
-        vecnormalize: written by ``VecNormalize.save``, if observations were standardised.
+        vecnormalize: file written by ``VecNormalize.save``, if observations were standardised.
 
     Raises:
         ConfigError: if a setting is wrong.
@@ -86,14 +86,14 @@ def _members(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         EOFError,
     ) as error:
         raise CheckpointError(
-            f"'{path}' is no zip of Stable-Baselines3's PPO ({files.reason(error)})"
+            f"'{path}' is not a zip of Stable-Baselines3's PPO ({files.reason(error)})"
         ) from error
     if not isinstance(found, dict):
-        raise CheckpointError(f"'{path}': its data is no mapping")
+        raise CheckpointError(f"'{path}': its data is not a mapping")
     if not isinstance(tensors, Mapping) or not all(
         isinstance(value, Tensor) for value in tensors.values()
     ):
-        raise CheckpointError(f"'{path}': its policy.pth is no mapping of tensors")
+        raise CheckpointError(f"'{path}': its policy.pth is not a mapping of tensors")
     return found, dict(tensors)
 
 
@@ -108,7 +108,7 @@ def _member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
 
 
 def _flat(weights: bytes, path: Path) -> bytes:
-    """Return the content of a ``.pth``, a zip itself, once what it unpacks to is known."""
+    """Check the unpacked size of a ``.pth``, a zip itself; return its content unchanged."""
     with zipfile.ZipFile(io.BytesIO(weights)) as archive:
         size = sum(info.file_size for info in archive.infolist())
     if size > MOST_BYTES:
@@ -148,7 +148,7 @@ def _network(
         state["log_std"] = weights["log_std"]
         hidden = [len(weights[f"mlp_extractor.policy_net.{i}.weight"]) for i in layers]
         size = int(state["policy.0.weight"].shape[1])
-        # The evaluation of a policy needs no values.
+        # Evaluating a policy needs no value function: the critic is zero.
         critic = {n.replace("policy", "critic"): torch.zeros_like(w) for n, w in state.items()}
         last = f"critic.{2 * len(layers)}"
         critic |= {f"{last}.weight": torch.zeros(1, hidden[-1]), f"{last}.bias": torch.zeros(1)}

@@ -27,10 +27,10 @@ def write_scene(library: Library, cfg: ExperimentCfg, folder: Path) -> None:
     Args:
         library: the library of the task's assets.
         cfg: the experiment.
-        folder: it must be new or empty; all or nothing of it is written.
+        folder: a new or empty folder; written completely or not at all.
 
     Raises:
-        ConfigError: if the folder has something in it, or cannot be written.
+        ConfigError: if the folder is not empty, or cannot be written.
         SceneError: if the scene does not compile.
     """
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):

@@ -1,4 +1,4 @@
-"""Policies as safetensors: weights that cannot run code, and a JSON text that describes them."""
+"""Policies as safetensors files, which cannot run code: weights, and a JSON description."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from pgdm.rl.evaluate import network_of
 from pgdm.rl.networks import ActorCritic, SquashedPolicy
 
 MOST_BYTES = 1 << 26
-"""Largest file that is read, and largest content of a compressed one."""
+"""Largest file that is read, and largest content of a compressed file, bytes."""
 _COMMANDS = "wrist.commands"
 _NETWORK = "network."
-# Half-precision weights: two bytes that resemble those two before.
+# Tuned for float16 weights, whose bytes resemble the bytes two positions before.
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 0, "lp": 1, "pb": 1}]
 
 
@@ -41,9 +41,9 @@ def pack(
 
     Args:
         policy: the policy.
-        commands: of the planned wrist, (T-1, 6), or None.
-        about: its description.
-        half: whether to round float32 weights to float16; statistics keep their precision.
+        commands: base commands of the wrist plan, (T-1, 6) m and rad, or None.
+        about: the policy's description.
+        half: whether to round float32 weights to float16; observation statistics stay float64.
     """
     tensors = {}
     for name, value in policy.network.state_dict().items():
@@ -73,7 +73,7 @@ def read(path: Path) -> TrainedPolicy:
     """Read a policy from a ``.safetensors`` or ``.safetensors.xz``; nothing in it is executed.
 
     Raises:
-        CheckpointError: if the file is missing, damaged or holds no policy of pgdm.
+        CheckpointError: if the file is missing, is damaged or holds no policy of pgdm.
         ConfigError: if its settings are damaged.
     """
     try:
@@ -88,8 +88,8 @@ def parse(raw: bytes, where: str, video: Path) -> TrainedPolicy:
 
     Args:
         raw: the content.
-        where: what it is from, for messages.
-        video: where a video is written.
+        where: source of the content, for messages.
+        video: path for a video of the policy.
     """
     raw = _unpacked(raw, where)
     about = _about(raw, where)
@@ -151,7 +151,9 @@ def _about(raw: bytes, where: str) -> dict[str, Any]:
     """Return the description in a safetensors header: 8 bytes with its length, then JSON."""
     size = int.from_bytes(raw[:8], "little")
     if len(raw) < 8 or size > len(raw) - 8:
-        raise CheckpointError(f"{where} is no safetensors file, or is cut off ({len(raw)} bytes)")
+        raise CheckpointError(
+            f"{where} is not a safetensors file, or is cut off ({len(raw)} bytes)"
+        )
     try:
         header = files.parse_json(raw[8 : 8 + size])
         about = files.parse_json(header["__metadata__"][KEY].encode())
@@ -171,7 +173,7 @@ def _about(raw: bytes, where: str) -> dict[str, Any]:
     if not all(isinstance(number, int | float) for number in numbers):
         raise CheckpointError(f"{where} is damaged: 'evaluation' is {evaluation!r:.40}")
     if not isinstance(about["facts"].get("versions", {}), dict):
-        raise CheckpointError(f"{where} is damaged: its versions are no mapping")
+        raise CheckpointError(f"{where} is damaged: its versions are not a mapping")
     return about
 
 
@@ -187,7 +189,7 @@ def _network(
 
 
 def halved(policy: TrainedPolicy) -> TrainedPolicy:
-    """Return a policy with its weights rounded to float16, computing in float32 as before."""
+    """Return a policy with its weights rounded to float16; it still computes in float32."""
     rounded = {
         name: value.half() if value.dtype == torch.float32 else value
         for name, value in policy.network.state_dict().items()

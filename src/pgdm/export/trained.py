@@ -29,21 +29,21 @@ class TrainedPolicy:
     """A policy, the settings it was trained with, and what was recorded about it."""
 
     name: str
-    """What it was read from, for messages."""
+    """Source of the policy, such as a file, for messages."""
     cfg: ExperimentCfg
     """Settings of its training."""
     network: ActorCritic | SquashedPolicy
-    """With its statistics of the observations."""
+    """The policy network, with its observation statistics."""
     frames: int
     """Length of the training, environment steps."""
     facts: Mapping[str, Any]
-    """Sources and hashes of the assets, and versions, at the training; empty if unknown."""
+    """Sources and hashes of the assets, and versions, used in training; empty if unknown."""
     video: Path
-    """Where a video of the policy is written."""
+    """Path for a video of the policy."""
     commands: np.ndarray | None = None
-    """Commands of the planned wrist, (T-1, 6) m and rad; None: the run's or the library's own."""
+    """Base commands of the wrist plan, (T-1, 6) m and rad; None: those of the run or library."""
     evaluation: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Metrics stored with it."""
+    """Metrics stored with the policy."""
 
     def sha256(self) -> str:
         """Return a hash of names, shapes and values of its weights and statistics."""
@@ -54,7 +54,7 @@ class TrainedPolicy:
         return digest.hexdigest()
 
     def settings(self) -> dict[str, Any]:
-        """Return its settings as plain containers, without those of one machine."""
+        """Return the settings as plain containers, without those that depend on the machine."""
         tracking = dataclasses.replace(self.cfg.tracking, kind="none", uri=None)
         cfg = dataclasses.replace(self.cfg, tracking=tracking, num_threads=0, device="cpu")
         settings = dataclasses.asdict(cfg)
@@ -62,11 +62,11 @@ class TrainedPolicy:
         return {"format": FORMAT, **settings}
 
     def builder(self, notify: Notify, progress: StepProgress | None = None) -> EnvBuilder:
-        """Compile its task, and check that it is the one that the policy was trained in.
+        """Compile the policy's task, and check that its assets are those used in training.
 
         Raises:
             PgdmError: if an asset is missing and cannot be made.
-            RunError: if the assets are not those of the training.
+            RunError: if the assets differ from those used in training.
             CheckpointError: if observations or actions have other sizes.
         """
         library = assets(self.cfg, notify, progress).serving(self.facts.get("asset_source"))
@@ -95,9 +95,9 @@ def of_run(path: Path, best: bool = False) -> TrainedPolicy:
         best: whether to take a run's best checkpoint, if it has one, instead of its last.
 
     Raises:
-        RunError: if it is neither.
-        CheckpointError: if the run has no checkpoint yet, or it is damaged.
-        ConfigError: if its settings are damaged.
+        RunError: if ``path`` is neither.
+        CheckpointError: if the run has no checkpoint yet, or the checkpoint is damaged.
+        ConfigError: if the run's settings are damaged.
     """
     run_dir, checkpoint, state = find_checkpoint(path, best)
     cfg = load_config(run_dir)
@@ -112,10 +112,10 @@ def of_run(path: Path, best: bool = False) -> TrainedPolicy:
 
 
 def checked(network: ActorCritic | SquashedPolicy, where: str) -> ActorCritic | SquashedPolicy:
-    """Return a network, once its numbers are checked.
+    """Check a network's weights and statistics, and return it.
 
     Raises:
-        CheckpointError: if one is not finite, or a variance is negative.
+        CheckpointError: if a value is not finite, or a variance is negative.
     """
     for name, tensor in network.state_dict().items():
         if not bool(torch.isfinite(tensor).all()):

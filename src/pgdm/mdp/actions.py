@@ -28,7 +28,7 @@ class ActionCfg:
     """``absolute``: joint position targets (the paper); ``residual``: the base follows the
     exemplar motion and the policy adds a correction."""
     lead_steps: int
-    """Residual: control steps by which the base's command leads the motion, against servo lag."""
+    """Residual: control steps by which the base's command leads the motion, to offset servo lag."""
     residual_scale: float
     """Residual: largest correction as a fraction of the half-range of each base joint (0..1)."""
     wrist_path: str
@@ -36,7 +36,7 @@ class ActionCfg:
     `pgdm.wrist.path`)."""
     hold_steps: int
     """Only ``planned``: control steps for which the hand stays at its pre-grasp while the fingers
-    close; it catches up in as many."""
+    close; it catches up with the motion in as many steps."""
 
     carry_load: bool
     """Only ``planned``: whether the commands compensate for the object's weight once the motion
@@ -95,7 +95,7 @@ def _range(index: SceneIndex) -> tuple[Tensor, Tensor]:
 
 
 def normalize(index: SceneIndex, qpos: Tensor) -> Tensor:
-    """Return the action (nu,) whose absolute target is the hand's part of qpos (nq,), clipped."""
+    """Return the absolute action (nu,) whose targets are the driven joints of qpos, clipped."""
     middle, half = _range(index)
     return ((qpos[index.driven] - middle) / half).clamp(-1.0, 1.0)
 
@@ -113,7 +113,7 @@ def _absolute(index: SceneIndex, start: Tensor) -> ActionMap:
 
 
 def warm_targets(index: SceneIndex, start: Tensor) -> Tensor:
-    """Return the targets (nu,) of the warm start, m and rad: where fingers are held untrained."""
+    """Return the actuator targets (nu,) of an absolute action map's warm start, m and rad."""
     middle, half = _range(index)
     return middle + half * _warm_start(index, start)
 
@@ -131,7 +131,7 @@ def _residual(
         raise ConfigError("action.wrist_path=planned needs the commands of a plan")
     if commands is None:
         path, lead = PATHS[cfg.wrist_path](index, reference, start), cfg.lead_steps
-    else:  # they account for the lag of the servos
+    else:  # planned commands already compensate for the servo lag
         path, lead = torch.cat((commands, commands[-1:])), 0
     low, high = torch.from_numpy(index.ctrl_low)[:n], torch.from_numpy(index.ctrl_high)[:n]
     largest = cfg.residual_scale * 0.5 * (high - low)
@@ -150,23 +150,23 @@ def action_map(
     """Return the configured map for a task that starts at qpos ``start``.
 
     Absolute (the paper): target = middle + half * a, with middle and half-width of each actuator's
-    control range. Warm start (released code): the joint positions of the start in these units, plus
-    0.2 on entry 1 and on every entry from 6 on, clipped to [-1, 1].
+    control range. Warm start (released code): the action whose targets are the start's joint
+    positions, plus 0.2 on entry 1 and on every entry from 6 on, clipped to [-1, 1].
 
     Residual (pgdm's own): the same for the fingers; with the wrist path b, the base joints are
     commanded to b(min(t + lead_steps, T-1)) + residual_scale * half * a, clipped to their ranges.
     The commands of a wrist plan have no lead. The warm start is 0 for the base.
 
     Args:
-        cfg: what an action means.
+        cfg: settings of the action.
         index: index of the scene.
         reference: the exemplar motion.
         start: qpos (nq,) at the start.
-        commands: those of the wrist plan, base targets at each step (T-1, 6), m and rad, if any.
+        commands: base targets of the wrist plan at each step, (T-1, 6) m and rad, if any.
 
     Raises:
         UnknownNameError: if there is no such kind or path.
-        ConfigError: if the base's path is planned and ``commands`` is missing.
+        ConfigError: if the wrist path is ``planned`` and ``commands`` is missing.
     """
     check_name("action.wrist_path value", cfg.wrist_path, WRIST_PATHS)
     check_name("action kind", cfg.kind, KINDS)

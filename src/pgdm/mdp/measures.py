@@ -1,4 +1,4 @@
-"""Measures: quantities recorded at every step in plain units, one value per simulation."""
+"""Measures: quantities recorded at every step in m or rad, one value per simulation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def finger_joint_error(c: StepContext) -> Tensor:
 def contact_distance(c: StepContext) -> Tensor:
     """Return the distance of a fingertip from the expert's contact point on the object, (n,) m.
 
-    Mean over the fingers in contact; NaN at steps where the expert touches nothing.
+    Mean over the fingers with which the expert touches the object; NaN at steps without any.
     """
     wanted = c.in_contact
     total = torch.where(wanted, c.contact_distance, 0.0).sum(1)

@@ -44,7 +44,7 @@ def episode_metrics(
       paper's tables);
     - ``ori_error``: mean of phi_t, rad;
     - ``lifted``: of the steps whose target is at least lift_height_m above the object's start, the
-      fraction in which the object is too (not after a stop); NaN without such steps;
+      fraction in which the object is too (never after an early stop); NaN without such steps;
     - ``dropped``: 1 if the object was lifted and later below that height while its target was
       above, else 0;
     - ``length``: steps taken.

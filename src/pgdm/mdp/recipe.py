@@ -28,7 +28,7 @@ class RewardTerm:
     weight: float
     value: Callable[[StepContext], Tensor]  # -> (n,) before weighting
     shaping: bool = False
-    """Whether it is used in training only and is not part of the task's own return."""
+    """Whether the term is used in training only and left out of the metric ``return``."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Recipe:
     ends: tuple[EndTerm, ...]
     metrics: MetricsCfg
     schedules: tuple[Callable[[int], dict[str, float]], ...] = ()
-    """Maps environment steps so far to reward weights by term name; called once per iteration."""
+    """Each maps environment steps so far to reward weights by term name; called per iteration."""
 
     measures: tuple[Measure, ...] = ()
     """Recorded under their names, averaged over the steps of an episode."""
@@ -65,13 +65,13 @@ class Recipe:
     """Whether terms or measures compare the hand with an expert's."""
 
     def __post_init__(self) -> None:
-        """Check that the terms are of their kind, with valid and distinct names and real weights.
+        """Check that terms have the right class, valid and distinct names, and finite weights.
 
         Raises:
-            ConfigError: at the first one that is not.
+            ConfigError: at the first invalid term.
         """
         if not self.rewards or not self.ends:
-            raise ConfigError("a recipe needs a reward and a termination at least")
+            raise ConfigError("a recipe needs at least one reward and one termination")
         for kind, terms in (
             (RewardTerm, self.rewards),
             (EndTerm, self.ends),
@@ -81,7 +81,7 @@ class Recipe:
                 if not isinstance(term, kind):
                     raise ConfigError(f"a recipe has {term!r} where a {kind.__name__} is needed")
             names = [term.name for term in terms]
-            for name in names:  # MLflow would refuse others, after hours of training
+            for name in names:  # MLflow would reject others, after hours of training
                 check_path_part(f"name of a {kind.__name__}", name)
             twice = next((name for name in names if names.count(name) > 1), None)
             if twice is not None:
@@ -102,10 +102,10 @@ class Recipe:
         return replace(self, measures=(*self.measures, *new), needs_expert=True)
 
     def check(self, context: StepContext) -> None:
-        """Check that every term returns one value per simulation, terminations True or False.
+        """Check that every term returns one value per simulation, terminations a bool.
 
         Raises:
-            ConfigError: at the first one that does not.
+            ConfigError: at the first term that does not.
         """
         terms: dict[str, Callable[[StepContext], Tensor]] = {
             **{f"reward '{term.name}'": term.value for term in self.rewards},
@@ -157,7 +157,7 @@ def _called(name: str, term: Callable[[StepContext], Tensor], context: StepConte
         return term(context)
     except TypeError as error:
         if error.__traceback__ is not None and error.__traceback__.tb_next is not None:
-            raise  # from inside of the term
+            raise  # raised inside the term
         raise ConfigError(
             f"the {name} of this method cannot be called with a StepContext alone: {error}"
         ) from error

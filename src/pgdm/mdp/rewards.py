@@ -44,7 +44,7 @@ def tracking(c: StepContext, scale: float, orientation_scale: float) -> Tensor:
 
 
 def lift(c: StepContext, height_m: float) -> Tensor:
-    """Return 1 where object and target are both ``height_m`` above the object's start, (n,)."""
+    """Return 1 if object and target are ``height_m`` above the object's start, else 0, (n,)."""
     lower = torch.minimum(c.target_pos[:, 2], c.state.object_pos[:, 2])
     return (lower >= c.start_height + height_m).double()
 
@@ -58,12 +58,12 @@ def hand_imitation(c: StepContext, space: str, form: str, scale: float) -> Tenso
 
 
 def fingertip_contact(c: StepContext, form: str, scale: float) -> Tensor:
-    """Return the mean of exp(-scale d) over the fingers in contact, (n,) in [0, 1].
+    """Return the mean of exp(-scale d) over the expert's fingers in contact, (n,) in [0, 1].
 
-    GRAFF* (paper, App. D): d is the distance of a fingertip from the expert's contact point, |d|
-    [m] or |d|^2 [m^2]. The term is 0 at steps where the expert touches nothing. These steps depend
-    on time alone, so any constant would rank policies with equally long episodes the same, and
-    with 0 the logged term reflects contact only.
+    GRAFF* (paper, App. D): with the distance r [m] of a fingertip from the expert's contact point,
+    d = r (``norm``) or r^2 (``squared``). The term is 0 at steps where the expert touches nothing.
+    These steps depend on time alone, so any constant would rank policies with equally long episodes
+    the same; with 0 the logged term reflects contact only.
     """
     d = c.contact_distance
     value = torch.exp(-scale * (d.square() if form == "squared" else d))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class Ramp:
     """A reward weight that grows linearly: weight * min(1, steps so far / frames).
 
-    It depends on the environment steps alone, so a resumed training, or one with another number of
+    It depends on the environment steps alone, so a resumed run, or a run with another number of
     simulations, has the same weight after the same number of steps.
     """
 

@@ -1,7 +1,7 @@
-"""Shaping: what training may add to a task's own reward and terminations; evaluation never does.
+"""Shaping: what training may add to a task's reward and discount; evaluations never use it.
 
 The paper's reward is flat far from the target: exp(-50 e) is 0.05 at e = 6 cm, and the lift bonus
-does not depend on e. With the object error e [m], pgdm replaces reward and
+does not depend on e. With the object error e [m], shaping replaces reward and
 discount factor gamma by
 
     reward + kernel_weight exp(-kernel_scale e)    and    gamma exp(-(e / soft_end_m)^2)
@@ -21,12 +21,12 @@ from pgdm.mdp.context import StepContext
 from pgdm.mdp.recipe import Recipe, RewardTerm
 
 SLOPE = "slope"
-"""Recorded name of the wide tracking term, which is added to the reward."""
+"""Recorded name of the added reward term, a tracking term wider than the paper's."""
 
 
 @dataclass(frozen=True)
 class ShapingCfg:
-    """Settings of the additions."""
+    """Settings of the shaping."""
 
     name: str
     """Name of these settings in reports."""
@@ -38,7 +38,7 @@ class ShapingCfg:
     """Scale of the extra discount, m; None: none."""
 
     def described(self) -> str:
-        """Return the additions as a phrase, empty if there are none."""
+        """Return the shaping as a phrase, empty if it adds nothing."""
         parts = []
         if self.kernel_weight:
             width_m = 1 / self.kernel_scale
@@ -61,7 +61,7 @@ class ShapingCfg:
 
 
 def shaped(recipe: Recipe, cfg: ShapingCfg) -> Recipe:
-    """Return the recipe with the additions."""
+    """Return the recipe with the shaping's reward term and discount."""
     if cfg.kernel_weight:
         scale = cfg.kernel_scale
 

@@ -1,7 +1,7 @@
 """Terminations: reasons for an episode to terminate, one flag per simulation.
 
 All are true terminal states: nothing is bootstrapped after them. Truncation (a diverged
-simulation) is decided elsewhere.
+simulation) is decided in `pgdm.envs.batch_env`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def motion_ended(c: StepContext) -> Tensor:
 def hand_lost(c: StepContext, space: str, form: str, max_error: float, grace_steps: int) -> Tensor:
     """Return d > max_error, (n,) bool, with the hand error d (DeepMimic; paper, App. D).
 
-    False in the first ``grace_steps`` steps: some mined pre-grasps start beyond it.
+    False in the first ``grace_steps`` steps: in some mined pre-grasps d exceeds ``max_error``.
     ``space`` and ``form`` choose d, see `StepContext.hand_error`.
     """
     return (c.t > grace_steps) & (c.hand_error(space, form) > max_error)

@@ -1,4 +1,4 @@
-"""Methods: each turns its settings into a recipe. Users' own methods need no row here."""
+"""Methods: each turns its settings into a recipe. Users' methods need no entry in ``METHODS``."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def recipe(cfg: MethodCfg) -> Recipe:
     """Return the configured method's Recipe.
 
     Raises:
-        ConfigError: if there is no such method, or it ends Python or returns something else.
+        ConfigError: if there is no such method, or it exits Python or returns anything else.
     """
     try:
         made = find(cfg.name, METHODS).recipe(cfg)

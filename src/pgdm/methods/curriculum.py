@@ -16,7 +16,7 @@ class RampCfg:
     """How the tracking term's weight grows."""
 
     ramp_frames: int
-    """Environment steps over all simulations in which it grows linearly from 0 to its value."""
+    """Environment steps over all simulations in which the weight grows linearly from 0."""
 
     def validate(self) -> None:
         """Check the numbers.

@@ -1,6 +1,7 @@
 """DeepMimic: PGDM's terms plus imitation of an expert's hand (paper, App. D).
 
-Adds lambda_3 exp(-eta d) to the reward and terminates at d > gamma_h, with the hand error d.
+Adds lambda_3 exp(-eta d) to the reward and terminates at d > gamma_h, with the hand error
+d = |h - h_expert|^2 or |h - h_expert|, h being the hand's fingertip positions or joints.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ class ImitationCfg:
     """How the hand error is rewarded, and when it terminates an episode."""
 
     space: str
-    """h: ``fingertips`` (positions, m) or ``joints`` (all of the hand's, m and rad)."""
+    """h: ``fingertips`` (positions, m) or ``joints`` (all joints of the hand, m and rad)."""
     form: str
     """d: ``squared``, |h - h_expert|^2 (published appendix); ``norm``, its root (earlier text)."""
     weight: float
@@ -32,7 +33,7 @@ class ImitationCfg:
     max_hand_error: float | None
     """gamma_h, d beyond which an episode terminates; None: never."""
     grace_steps: int
-    """Control steps after reset in which d terminates no episode."""
+    """Control steps after reset during which d does not terminate an episode."""
 
     def validate(self) -> None:
         """Check names and numbers.
@@ -74,5 +75,5 @@ def add_imitation(base: Recipe, cfg: ImitationCfg) -> Recipe:
 
 
 def recipe(cfg: DeepMimicCfg) -> Recipe:
-    """Return PGDM's terms and those of imitation."""
+    """Return PGDM's terms and the imitation terms."""
     return add_imitation(pgdm.recipe(cfg), cfg.imitation)

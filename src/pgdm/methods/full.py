@@ -25,7 +25,7 @@ class FullCfg(MethodCfg):
 
 
 def recipe(cfg: FullCfg) -> Recipe:
-    """Return PGDM's terms and those of the sections that are not None."""
+    """Return PGDM's terms and the terms of all sections that are not None."""
     combined = pgdm.recipe(cfg)
     if cfg.imitation is not None:
         combined = add_imitation(combined, cfg.imitation)

@@ -1,7 +1,7 @@
 """GRAFF*: PGDM's terms plus a reward for fingertips at the expert's contacts (paper, App. D).
 
-Adds lambda times the mean of exp(-eta d) over the fingers in contact to the reward, with the
-distance d of a fingertip f from the expert's contact point c on the object.
+Adds to the reward lambda times the mean of exp(-eta d) over the expert's fingers in contact, with
+d = |c - f|^2 or |c - f| for a fingertip at f and the expert's contact point c on the object, in m.
 """
 
 from __future__ import annotations

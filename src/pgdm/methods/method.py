@@ -1,4 +1,4 @@
-"""What a method is, and how it is found by name."""
+"""The class of methods, and finding a method by name."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def find(name: str, methods: Mapping[str, Method]) -> Method:
 
     Raises:
         UnknownNameError: if there is no method of that name.
-        ConfigError: if the module does not exist, is no valid Python or has no such `Method`.
+        ConfigError: if the module does not exist, is not valid Python or has no such `Method`.
     """
     if ":" in name:
         return _imported(name)

@@ -15,7 +15,7 @@ from pgdm.mdp.terminations import TerminationCfg
 
 @dataclass(frozen=True)
 class MethodCfg:
-    """Settings of every method: its name, and PGDM's terms, which it builds on."""
+    """Settings that every method has: its name, and PGDM's terms, on which it builds."""
 
     name: str
     """Key of ``pgdm.methods.METHODS``, or ``my_package.module:attribute``."""
@@ -27,7 +27,7 @@ class MethodCfg:
     """Largest distance from the target at which a step counts as a success, m."""
 
     def validate(self) -> None:
-        """Check the numbers, then each section that has a ``validate`` of its own.
+        """Check the numbers, then ``validate`` each section that has this method.
 
         Raises:
             ConfigError: at the first invalid one.

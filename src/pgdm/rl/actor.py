@@ -1,4 +1,4 @@
-"""A Gaussian policy in the form that TorchRL's losses and collectors take."""
+"""A Gaussian policy in the form that TorchRL's losses and collectors expect."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from pgdm.rl.networks import Gaussian
 
 
 class GaussianActor(TensorDictModuleBase):
-    """A policy N(net(observation), exp(log_std)^2), one standard deviation for all observations.
+    """A policy N(net(observation), exp(log_std)^2) with state-independent standard deviations.
 
     Reads ``observation`` (..., D); writes ``loc`` and ``action``, (..., A), and
-    ``action_log_prob`` (...). It samples unless TorchRL's exploration type is a deterministic one.
+    ``action_log_prob`` (...). It samples unless TorchRL's exploration type is deterministic.
 
     Args:
         net: maps observations (..., D) to means (..., A).

@@ -39,10 +39,10 @@ def build_learner(
 
     Args:
         env: environment that its policy acts in.
-        cfg: its settings.
+        cfg: settings of the learner.
         seed: the run's seed.
-        total_frames: length of the training.
-        device: where the networks are.
+        total_frames: length of the training, environment steps.
+        device: device of the networks.
         num_threads: threads of torch; 0: torch's default.
         replay_folder: where an off-policy learner stores its replay, or None to keep it in memory.
 

@@ -28,7 +28,7 @@ class Callback:
     """Does nothing on any event; override those of interest."""
 
     def on_start(self, trainer: Trainer) -> None:
-        """Before the first step of a new or resumed training."""
+        """Before the first step of a new or resumed run."""
 
     def on_iteration(self, progress: Progress, metrics: dict[str, float]) -> None:
         """After each iteration, with its ``train/`` metrics."""
@@ -37,7 +37,7 @@ class Callback:
         """After each evaluation, with its ``eval_sampled/`` and ``eval_deterministic/`` metrics."""
 
     def on_checkpoint(self, progress: Progress, path: Path) -> None:
-        """After each checkpoint file."""
+        """After each checkpoint is written to ``path``."""
 
     def on_end(self, progress: Progress, status: str) -> None:
         """At the very end; status is ``finished``, ``interrupted`` or ``failed``."""

@@ -1,4 +1,4 @@
-"""Checkpoint files: written atomically, verified when read, never able to run code."""
+"""Checkpoint files: written atomically, verified when read; reading one never runs code."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ Check = Callable[[State], object]
 
 
 def _any(state: State) -> None:
-    """Accept a state as it is."""
+    """Accept any state."""
 
 
 class CheckpointFolder:
     """The checkpoints of one run: the newest few, and the best.
 
     Args:
-        folder: where they are; created with the first one.
+        folder: folder of the checkpoints; created with the first one.
         keep_last: how many of the newest are kept.
     """
 
@@ -56,7 +56,7 @@ class CheckpointFolder:
 
     @property
     def best(self) -> Path:
-        """File of the policy with the highest success, then return, so far; may not exist yet."""
+        """File of the best checkpoint so far, by success, then return; may not exist yet."""
         return self.folder / _BEST
 
     def all(self) -> list[Path]:
@@ -76,7 +76,7 @@ class CheckpointFolder:
         return path
 
     def save_best(self, state: State) -> Path:
-        """Write the state as the best one.
+        """Write the state as the best checkpoint.
 
         Raises:
             CheckpointError: if it cannot be written; the best one so far is untouched.
@@ -92,8 +92,8 @@ class CheckpointFolder:
     def newest(self, check: Check = _any) -> tuple[Path, State] | None:
         """Return the newest usable checkpoint and its state, or None if there is no checkpoint.
 
-        One that cannot be used is skipped in favour of the one before it, with a warning, and
-        renamed so that it is not counted among those to keep.
+        Unusable checkpoints are skipped with a warning. Once a usable one is found, they are
+        renamed to ``*.damaged`` so that they do not count towards ``keep_last``.
 
         Args:
             check: raises CheckpointError if a state cannot be used.
@@ -107,7 +107,7 @@ class CheckpointFolder:
                 state = read_checkpoint(path)
                 check(state)
             except CheckpointError as error:
-                _log.warning("%s: %s; resuming from the one before", path.name, error)
+                _log.warning("%s: %s; trying the checkpoint before it", path.name, error)
                 damaged.append(path)
                 reason = str(error)
                 continue
@@ -123,13 +123,13 @@ class CheckpointFolder:
 
 
 def write_checkpoint(path: Path, state: State) -> None:
-    """Write tensors and plain containers to a file, atomically.
+    """Write tensors and plain values to a file, atomically.
 
     The path always holds the old or the complete new file, also after a power failure.
 
     Raises:
         CheckpointError: if the file cannot be written, or ``state`` holds anything other than
-            tensors and plain values, which could not be read back.
+            tensors and plain values: it could not be read back.
     """
     payload = _encode(state)
     try:

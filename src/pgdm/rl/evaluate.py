@@ -1,4 +1,4 @@
-"""Evaluating a policy: whole episodes, sampled and deterministic, separate from the training."""
+"""Evaluation of a policy: whole episodes, sampled and deterministic, in separate simulations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class EvalCfg:
     video: bool
     """Whether to record a video of the evaluated policy."""
     video_every_eval: bool
-    """Whether to record one at every evaluation instead of only the last."""
+    """Whether to record a video at every evaluation instead of only the last."""
 
 
 class Policy(Protocol):
@@ -82,17 +82,17 @@ def run_episodes(
 
 
 class Evaluator:
-    """Evaluates a policy on simulations of its own.
+    """Evaluates a policy in simulations used for nothing else.
 
-    Every evaluation starts from the same state of the simulations and of the noise, so it depends
-    on the policy alone, also after a run was stopped and resumed.
+    Every evaluation starts from the same simulation states and random streams, so its result
+    depends on the policy alone, also after a run was stopped and resumed.
 
     Args:
         make_env: builds an environment with the given number of simulations; called once for the
             sampled and once for the deterministic policy.
         episodes: episodes of the sampled policy.
         deterministic_episodes: episodes of the deterministic policy; 1 unless the task itself is
-            random.
+            randomised.
         seed: the run's seed.
     """
 
@@ -114,10 +114,10 @@ class Evaluator:
     def evaluate(
         self, policy: Policy, stop: Callable[[], bool] = lambda: False
     ) -> dict[str, float] | None:
-        """Return ``eval_sampled/<metric>``, ``eval_deterministic/<metric>``, means over episodes.
+        """Return each metric's mean over episodes, or None if stopped.
 
-        With several episodes, ``<metric>_std`` is their sample standard deviation. None if it was
-        stopped.
+        Keys are ``eval_sampled/<metric>`` and ``eval_deterministic/<metric>``; with several
+        episodes, ``..._std`` is the sample standard deviation.
         """
         metrics: dict[str, float] = {}
         for kind in self._episodes:
@@ -139,9 +139,9 @@ class Evaluator:
 
 
 def summarise(results: dict[str, Tensor], prefix: str = "") -> dict[str, float]:
-    """Return each metric's mean over its episodes (k,), and its standard deviation if k > 1.
+    """Return each metric's mean over k episodes, and its sample standard deviation if k > 1.
 
-    Episodes to which a metric does not apply have NaN, and are left out.
+    Episodes in which a metric is undefined (NaN) are left out.
     """
     summary: dict[str, float] = {}
     for name, values in results.items():
@@ -153,10 +153,10 @@ def summarise(results: dict[str, Tensor], prefix: str = "") -> dict[str, float]:
 
 
 def policy_of(state: State, path: Path) -> ActorCritic | SquashedPolicy:
-    """Return the policy in the contents of a checkpoint.
+    """Return the policy in a checkpoint's state.
 
     Raises:
-        CheckpointError: if they hold no policy; names the file.
+        CheckpointError: if the state holds no policy; the message names ``path``, its file.
     """
     try:
         return network_of(state["network"], state["learner"]["model"])
@@ -171,9 +171,10 @@ def network_of(
     """Return a policy from its settings and its state dict; float16 weights become float32.
 
     Raises:
-        LookupError, TypeError, ValueError, AttributeError, RuntimeError: if they do not fit.
+        LookupError, TypeError, ValueError, AttributeError, RuntimeError: if settings or weights
+            are invalid or do not match.
     """
-    with torch.device("meta"):  # no memory for sizes that only the settings name
+    with torch.device("meta"):  # allocate nothing: the sizes come from a file
         squashed = "kind" in settings  # absent from the settings of an ActorCritic
         model = (
             SquashedPolicy(SquashedCfg(**settings))

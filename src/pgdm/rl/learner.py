@@ -1,4 +1,4 @@
-"""What the trainer needs of a learner: PPO and SAC differ behind it, and nowhere else."""
+"""The interface between trainer and learner, which PPO and SAC implement."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class AlgoCfg:
     """Settings that every learner has."""
 
     usual_steps_per_s: ClassVar[float] = 1_000.0
-    """Typical speed on two cores, midway between idle and busy ones, frames per second."""
+    """Typical training speed on two cores that are partly busy with other work, frames/s."""
     usual_frame_bytes: ClassVar[int] = 0
-    """Disk space each frame needs until the run has finished, approximate."""
+    """Approximate disk space that each frame needs until the run has finished, bytes."""
 
     learner: str
     """``ppo`` or ``sac``."""
     name: str
-    """Name of the settings, as reports show it."""
+    """Name of these settings, as shown in reports."""
     gamma: float
     """Discount per control step, 0..1."""
     learning_rate: float
@@ -45,15 +45,15 @@ class AlgoCfg:
     """Standardised observations are clipped here, standard deviations."""
 
     def check(self, num_envs: int) -> None:
-        """Check what depends on the number of simulations.
+        """Check the settings, also against the number of simulations.
 
         Raises:
-            ConfigError: with the values, if they do not fit.
+            ConfigError: if they are invalid; the message has the values.
         """
 
     @property
     def networks(self) -> int:
-        """How many networks of ``hidden`` layers learn."""
+        """Number of trained networks, each with the layers ``hidden``."""
         return 2
 
     def memory_bytes(self, env: VecEnv, num_envs: int) -> int:
@@ -64,7 +64,7 @@ class AlgoCfg:
         return 4 * (4 * weights + num_envs * self.steps_per_env * frame)
 
     def disk_bytes(self, env: VecEnv, num_envs: int, total_frames: int) -> int:
-        """Return the disk space that a run of so many frames needs while it runs, bytes."""
+        """Return the disk space that a run of ``total_frames`` needs while it runs, bytes."""
         return 0
 
 
@@ -73,7 +73,7 @@ class Model(Protocol):
 
     @property
     def cfg(self) -> Any:
-        """Settings it is built from, a dataclass of plain values."""
+        """Settings from which the policy is built, a dataclass of plain values."""
         ...
 
     def sample(
@@ -90,7 +90,7 @@ class Model(Protocol):
 
 
 class Learner(Protocol):
-    """Improves a policy from what it did, at three moments of an iteration."""
+    """Improves a policy from its experience: during each step, after it, and after each rollout."""
 
     @property
     def model(self) -> Model:
@@ -103,18 +103,18 @@ class Learner(Protocol):
         ...
 
     def during_step(self) -> None:
-        """Work while the simulations take a step, on what was seen before it."""
+        """Learn while the simulations take a step, from earlier steps only."""
         ...
 
     def after_step(self, step: Mapping[str, Any]) -> None:
-        """Take in a step: nested columns (N, ...) with the keys of `RolloutCollector`."""
+        """Receive the step just taken: nested columns (N, ...) with the keys of a rollout."""
         ...
 
     def learn(self, rollout: TensorDict) -> dict[str, float]:
-        """Work after an iteration's last step, with its rollout [N, T]; return what is logged.
+        """Learn from an iteration's rollout [N, T]; return metrics to log.
 
         Raises:
-            RunError: if a loss or gradient is not finite; that step is then not taken.
+            RunError: if a loss, gradient or weight is not finite.
         """
         ...
 

@@ -13,12 +13,12 @@ from torch import Generator, Tensor, nn
 from pgdm.errors import RunError
 from pgdm.rl.normalizer import Normalizer
 
-# Gains of stable-baselines3, which trained the paper's policies.
+# Gains of the initial weights in stable-baselines3, with which the paper's policies were trained.
 _HIDDEN_GAIN, _MEAN_GAIN, _VALUE_GAIN = math.sqrt(2), 0.01, 1.0
 _NO_GENERATOR = "sampling an action needs a generator; pass one or deterministic=True"
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
-_LOG_STD_RANGE = (-5.0, 1.0)  # of a squashed policy, before the squashing
-_WARM_START_LIMIT = 0.95  # beyond it tanh is too flat to learn
+_LOG_STD_RANGE = (-5.0, 1.0)  # bounds in a squashed policy, before tanh
+_WARM_START_LIMIT = 0.95  # bound of a squashed policy's initial mean: beyond it tanh is too flat
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class NetworkCfg:
 
 
 class Gaussian(NamedTuple):
-    """N(loc, exp(log_std)^2) with independent entries, the same deviations in each row."""
+    """N(loc, exp(log_std)^2) with independent entries; all rows share the standard deviations."""
 
     loc: Tensor
     """Means, (..., A)."""
@@ -58,15 +58,15 @@ class Gaussian(NamedTuple):
 
 
 class ActorCritic(nn.Module):
-    """A Gaussian policy with a free standard deviation, and a value function.
+    """A Gaussian policy with learned, state-independent standard deviations, and a value function.
 
-    Actions are neither squashed nor clipped: the environment clips, and the log-probability is
-    that of the unclipped action (as in stable-baselines3).
+    Actions are neither squashed nor clipped here: the environment clips them, and log-probabilities
+    are those of the unclipped actions (as in stable-baselines3).
 
     Args:
         cfg: sizes and initial values.
-        generator: stream of the orthogonal initial weights; None leaves them uninitialised, for
-            weights that are loaded afterwards.
+        generator: random stream of the orthogonal initial weights; None leaves the weights
+            uninitialised, to be loaded later.
         mean_bias: initial mean (A,) of the policy, or None for 0.
     """
 
@@ -103,7 +103,7 @@ class ActorCritic(nn.Module):
         return obs if self.normalizer is None else self.normalizer(obs)
 
     def value(self, normalized: Tensor) -> Tensor:
-        """Return the discounted return (M,) expected from normalised observations (M, D)."""
+        """Return the discounted return (...) expected from normalised observations (..., D)."""
         return self.critic(normalized).squeeze(-1)
 
     def mean(self, obs: Tensor) -> Tensor:
@@ -114,8 +114,8 @@ class ActorCritic(nn.Module):
     def sample(self, obs: Tensor, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
         """Draw actions (N, A) at raw observations (N, D); return them and the policy's means.
 
-        The noise is drawn on the CPU, so that a run with its networks elsewhere draws the same:
-        from ``generator``, or from torch's global stream.
+        The noise is drawn on the CPU, so that it does not depend on the networks' device: from
+        ``generator``, or if None, from torch's global stream.
         """
         mean = self.mean(obs.to(self.device))
         noise = torch.randn(mean.shape, generator=generator).to(self.device)
@@ -147,7 +147,7 @@ class SquashedCfg:
     """Settings to rebuild the policy of an off-policy checkpoint from."""
 
     kind: str
-    """``squashed``; distinguishes it from a ``NetworkCfg``."""
+    """``squashed``; distinguishes these settings from a ``NetworkCfg``."""
     obs_dim: int
     """D, numbers in an observation."""
     action_dim: int
@@ -155,13 +155,13 @@ class SquashedCfg:
     hidden: list[int]
     """Widths of the hidden layers."""
     log_std_init: float
-    """Log of the initial standard deviation, before the squashing."""
+    """Log of the initial standard deviation, before tanh."""
     observation_clip: float
     """Standardised observations are clipped here, standard deviations."""
 
 
 class SquashedPolicy(nn.Module):
-    """A Gaussian whose mean and deviation depend on the observation, squashed by tanh to (-1, 1).
+    """A Gaussian with state-dependent mean and standard deviation, squashed by tanh to (-1, 1).
 
     Args:
         cfg: sizes and initial values.
@@ -197,7 +197,7 @@ class SquashedPolicy(nn.Module):
         return next(self.net.parameters()).device
 
     def forward(self, normalized: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and deviation before the squashing, (M, A) each, at (M, D) normalised."""
+        """Return mean and standard deviation before tanh, (M, A), at (M, D) normalised."""
         mean, log_std = precise_end(self.net, normalized).chunk(2, -1)
         return mean, log_std.clamp(*_LOG_STD_RANGE).exp()
 
@@ -229,7 +229,7 @@ class SquashedPolicy(nn.Module):
 
 
 class ActionValue(nn.Module):
-    """The discounted return (M, 1) expected after actions (M, A) at normalised (M, D)."""
+    """A critic Q(s, a): the value (M, 1) of actions (M, A) at normalised observations (M, D)."""
 
     def __init__(
         self, obs_dim: int, action_dim: int, hidden: Sequence[int], generator: Generator
@@ -245,7 +245,7 @@ class ActionValue(nn.Module):
 def precise_end(net: nn.Sequential, inputs: Tensor) -> Tensor:
     """Return a network's outputs, with the last layer in float32 even under autocast.
 
-    It costs nothing, while bfloat16 would round a value of 12 to multiples of 0.06.
+    The cost is negligible, whereas bfloat16 would round a value near 12 to a multiple of 0.06.
     """
     hidden = net[:-1](inputs)
     with torch.autocast(inputs.device.type, enabled=False):
@@ -255,7 +255,7 @@ def precise_end(net: nn.Sequential, inputs: Tensor) -> Tensor:
 def silu_mlp(
     inputs: int, hidden: Sequence[int], outputs: int, generator: Generator | None
 ) -> nn.Sequential:
-    """Return hidden layers with layer norm and SiLU, weights uniform in +-1/sqrt(fan-in)."""
+    """Return an MLP with layer norm and SiLU, initial weights uniform in +-1/sqrt(fan-in)."""
     layers: list[nn.Module] = []
     for width in hidden:
         layers += [_linear(inputs, width), nn.LayerNorm(width), nn.SiLU()]

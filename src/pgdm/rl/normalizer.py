@@ -10,11 +10,10 @@ EPS = 1e-8
 
 
 class Normalizer(nn.Module):
-    """Standardises observations by the mean and variance of those it was updated with.
+    """Standardises observations by the mean and variance of those passed to ``update``.
 
-    Before the first ``update`` it only clips. Statistics change in ``update`` alone: the learner
-    calls it after the gradient steps of an iteration, so that acting and learning see the same
-    standardised observations.
+    Before the first ``update`` it only clips. PPO calls ``update`` after an iteration's gradient
+    steps, so that acting and learning use the same statistics; SAC calls it after every step.
 
     Args:
         size: D, numbers in an observation.
@@ -39,7 +38,11 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
-        """Take in observations (M, D): the parallel form of Welford's update (Chan et al. 1979)."""
+        """Add observations (M, D) to the statistics (parallel Welford, Chan et al. 1979).
+
+        With w = M / (count + M), delta = batch mean - mean:
+        mean <- mean + w delta,  var <- (1 - w) var + w batch var + w (1 - w) delta^2.
+        """
         samples = obs.double()
         var, mean = torch.var_mean(samples, dim=0, correction=0)
         total = self.count + len(obs)

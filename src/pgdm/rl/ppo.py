@@ -42,12 +42,12 @@ class PPOCfg(AlgoCfg):
     normalize_advantage: bool
     """Whether advantages are standardised within each minibatch."""
     max_grad_norm: float
-    """Gradients are scaled down to this norm."""
+    """Largest gradient norm; gradients above it are scaled down."""
     normalize_observations: bool
     """Whether observations are standardised by their running mean and variance."""
 
     def check(self, num_envs: int) -> None:
-        """Check that minibatches divide an iteration's samples; see `AlgoCfg.check`."""
+        """Check that the minibatch size divides an iteration's samples; see `AlgoCfg.check`."""
         check_batch(self, num_envs)
 
 
@@ -68,16 +68,16 @@ def build_model(env: VecEnv, cfg: PPOCfg, seed: int, device: str) -> ActorCritic
 class PPOLearner:
     """Holds the optimiser and takes the gradient steps.
 
-    Policy and value function are separate networks that meet only in the norm of the gradient. On
-    a CPU with threads to spare each learns in its own thread. Torch's threads would split every
-    single matrix product instead: no faster on an idle machine, and many times slower on a busy one
-    because each product then waits for the slowest thread. It also makes the result independent of
-    the number of threads.
+    Policy and value function are separate networks, coupled only by the norm to which their joint
+    gradient is clipped. On a CPU with two or more threads each learns in its own thread. Splitting
+    each matrix product over torch's threads would be no faster on an idle machine, much slower on
+    a busy one, where each product waits for the slowest thread, and the result would depend on the
+    number of threads.
 
     Args:
         model: policy and value function, changed in place.
         cfg: settings of PPO.
-        generator: stream of the order in which samples are visited.
+        generator: random stream of the samples' order in each pass.
         num_threads: threads to use; more than 2 make no difference.
     """
 
@@ -112,13 +112,13 @@ class PPOLearner:
         """Do nothing: the rollout holds the step."""
 
     def learn(self, rollout: TensorDict) -> dict[str, float]:
-        """Make ``epochs`` passes over a rollout; return what is logged.
+        """Make ``epochs`` passes over a rollout; return metrics to log.
 
-        The statistics of the observations are updated last: acting and learning of one iteration
-        see the same ones.
+        The observation statistics are updated last, so that acting and learning of an iteration
+        use the same ones.
 
         Raises:
-            RunError: if a loss or gradient is not finite; that step is then not taken.
+            RunError: if a loss or gradient is not finite; that gradient step is not taken.
         """
         with torch_threads(1):
             samples, metrics = self._prepare(rollout)
@@ -136,7 +136,7 @@ class PPOLearner:
         return {**metrics, **dict(zip(_LOGGED, means, strict=True)), "action_std": std, "lr": lr}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, optimiser and the state of the visiting order's stream."""
+        """Return the states of networks, optimiser and random stream."""
         return {
             "model": {name: value.clone() for name, value in self.model.state_dict().items()},
             "optimizer": self._optimizer.state_dict(),
@@ -150,18 +150,18 @@ class PPOLearner:
         self._generator.set_state(state["generator"])
 
     def _prepare(self, rollout: TensorDict) -> tuple[TensorDict, dict[str, float]]:
-        """Return all T * N samples with their advantages, and the value function's quality."""
+        """Return all T * N samples with their advantages, and metrics of the value function."""
         from tensordict import TensorDict
 
         from pgdm.rl.loss import advantages
 
         cfg, model = self.cfg, self.model
-        steps = rollout.transpose(0, 1)  # [T, N], as they lie in memory
+        steps = rollout.transpose(0, 1)  # [T, N], the layout in memory
         after: Any = steps["next"]
         with torch.no_grad():
             seen = torch.cat((steps["observation"], after["observation"][-1:]))
             obs = model.normalize(seen.to(model.device))  # (T + 1, N, D)
-            # Once an iteration, as in the released code; the same pass values what follows.
+            # Evaluated once per iteration, as in the released code.
             values = model.value(obs).to(seen.device)  # (T + 1, N)
             next_values = values[1:].clone()
             truncated = after["truncated"][..., 0]
@@ -215,7 +215,7 @@ class PPOLearner:
 
         minibatch = TensorDict(_minibatch(samples, rows, _VALUE_KEYS), [len(rows)])
         error, *_ = self._loss.loss_critic(minibatch)
-        (self.cfg.value_coef * error).backward()  # here, so that the error is logged unweighted
+        (self.cfg.value_coef * error).backward()  # weighted here: the returned error is logged
         return error
 
 
@@ -230,23 +230,23 @@ _LOGGED = {
     "ess": "ESS",
     "grad_norm": "norm",
 }
-"""Means over the gradient steps of an iteration: names in the log and in TorchRL."""
+"""Metrics logged as means over an iteration's gradient steps: name in the log, key in ``out``."""
 
 
 def _minibatch(samples: TensorDict, rows: Tensor, keys: Sequence[str]) -> dict[str, Tensor]:
-    """Return some rows (M,) of some columns; a TensorDict costs 1% of the training more."""
+    """Return the given rows (M,) and columns; a dict, since a TensorDict slows PPO by 1%."""
     return {key: samples.get(key).index_select(0, rows) for key in keys}
 
 
 _MOST_SAMPLES = 100_000
-"""Largest minibatch size that is proposed."""
+"""Largest minibatch size that an error message proposes."""
 
 
 def check_batch(cfg: PPOCfg, num_envs: int) -> None:
-    """Check that minibatches divide the samples of an iteration.
+    """Check that the minibatch size divides the samples of an iteration.
 
     Raises:
-        ConfigError: with the sizes, if they do not.
+        ConfigError: if it does not; the message has the sizes.
     """
     samples, size = num_envs * cfg.steps_per_env, cfg.minibatch_size
     if samples % size:

@@ -1,4 +1,4 @@
-"""The replay: every frame of a run, in append-only files in its folder."""
+"""The replay: all frames that an off-policy learner has seen, as files in the run folder."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ class Column:
 class Replay:
     """Frames in the order in which they were seen, sampled uniformly.
 
-    A column is one file. Files are reserved in full at the start, so that a full disk is an error
-    then and not in the middle of a run; appended frames survive the death of the process. A
-    checkpoint holds the number of frames and a checksum of each column instead of a copy: frames
-    appended after it are overwritten when the run is resumed.
+    Each column is a file. Disk space is reserved in full at the start, so that a full disk is found
+    then and not in the middle of a run. Appended frames survive the death of the process. A
+    checkpoint holds the number of frames and a checksum of each column instead of a copy; frames
+    appended after the checkpoint are overwritten when the run is resumed.
 
     Args:
         columns: the values of a frame, by name.
         capacity: number of frames to reserve room for.
         batch_size: frames in a sample.
-        generator: stream of the sampled rows.
-        folder: where the files are, or None to keep the frames in memory.
-        mirror: device on which the frames are kept as well and samples are drawn; the files are
-            then written when the state is saved, not with every step.
+        generator: random stream of the sampled rows.
+        folder: folder of the files, or None to keep the frames in memory.
+        mirror: device that holds a copy of all frames and draws the samples; the files are then
+            written by ``state_dict`` only, not by every ``append``.
 
     Raises:
         RunError: if the disk has no room for the files.
@@ -119,7 +119,7 @@ class Replay:
         return drawn.apply(lambda x: x.float() if x.dtype == torch.float16 else x)
 
     def sync(self) -> None:
-        """Wait until all frames are on the disk, so that a checkpoint never refers to others."""
+        """Wait until the files are on disk: checkpoints must not refer to unwritten frames."""
         for path in self._files():
             with open(path, "rb") as file:
                 os.fsync(file.fileno())
@@ -135,11 +135,11 @@ class Replay:
         return {"frames": len(self), "crc32": dict(self._crc)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from the first ``frames`` frames of the files.
+        """Continue after the first ``frames`` frames of the files, as counted by the state.
 
         Raises:
-            CheckpointError: if the files do not hold these frames; newly created files are then
-                deleted again.
+            CheckpointError: if the files do not hold these frames; files that this replay has
+                created are then deleted.
         """
         frames, expected = int(state["frames"]), state["crc32"]
         where = self.folder or "the memory"
@@ -170,7 +170,7 @@ class Replay:
         self._set_length(frames)
 
     def _stored_too(self, rows: Mapping[str, Tensor], count: int) -> None:
-        """Include the next ``count`` rows of the files in the checksums."""
+        """Include the next ``count`` frames of the files in the checksums."""
         self._stored += count
         for name, values in rows.items():
             self._crc[name] = zlib.crc32(values.numpy().data, self._crc[name])
@@ -185,7 +185,7 @@ class Replay:
 
 
 def _describe(folder: Path, columns: Mapping[str, Column]) -> None:
-    """Describe the files, for reading them without pgdm."""
+    """Write ``columns.json``, which describes the files to readers without pgdm."""
     about = {
         name: {
             "file": f"{name}{_SUFFIX}",
@@ -212,12 +212,12 @@ def _reserve(folder: Path, columns: Mapping[str, Column], capacity: int) -> list
     before = {path: path.stat().st_size for path in sizes if path.exists()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        disk = shutil.disk_usage(folder)  # all zero where the file system does not say
+        disk = shutil.disk_usage(folder)  # all zero if the file system does not report it
         if disk.total and sum(sizes.values()) - sum(before.values()) > disk.free:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         for path, size in sizes.items():
-            # Not in appending mode, and readable: if the file system cannot reserve (NFS), the C
-            # library reads and writes a byte of each block instead.
+            # O_RDWR without O_APPEND: on file systems that cannot reserve (NFS), posix_fallocate
+            # reads and rewrites a byte of each block instead.
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
             try:
                 os.posix_fallocate(descriptor, 0, size)

@@ -1,4 +1,4 @@
-"""Soft actor-critic: learns from every frame many times, from a replay."""
+"""Soft actor-critic: learns from frames sampled from a replay."""
 
 from __future__ import annotations
 
@@ -32,25 +32,26 @@ class SACCfg(AlgoCfg):
     usual_frame_bytes: ClassVar[int] = 1_400
 
     reward_scale: float
-    """Factor on the rewards that are learned from."""
+    """Factor on the rewards in the learner's targets."""
     adam_betas: list[float]
     """Adam's two decay rates, (2,) each 0..1."""
     critics: int
-    """Number of critics; their lowest value is used."""
+    """Number of critics; the lowest of their values is used."""
     target_rate: float
-    """Share by which the target critics move to the critics in each update, 0..1."""
+    """Fraction by which the target critics move towards the critics in each update, 0..1."""
     batch_size: int
     """M, frames in one update."""
     updates_per_step: int
     """Updates of the critics per control step of all simulations."""
     actor_interval: int
-    """The policy is updated once every so many updates of the critics."""
+    """Updates of the critics per update of policy and temperature."""
     target_entropy: float
-    """Entropy of the policy that the temperature aims at first, nats per action dimension."""
+    """Target of the policy's entropy at the start, nats per action dimension."""
     target_entropy_end: float
     """Target entropy after ``target_entropy_frames``, reached linearly."""
     target_entropy_frames: int
-    """Environment steps over which it falls; not the run's length, so that runs can be extended."""
+    """Environment steps over which the target entropy changes; fixed, so that extending a run does
+    not alter it."""
     temperature_init: float
     """Weight of the entropy in the return at the start."""
     warmup_steps: int
@@ -69,7 +70,7 @@ class SACCfg(AlgoCfg):
 
     @property
     def networks(self) -> int:
-        """The policy and the critics."""
+        """Number of trained networks: the policy and the critics."""
         return 1 + self.critics
 
     def capacity(self, num_envs: int, total_frames: int) -> int:
@@ -84,20 +85,20 @@ class SACCfg(AlgoCfg):
 
 
 class SACLearner:
-    """Holds networks, targets, temperature, optimisers and the replay.
+    """Holds networks, target networks, temperature, optimisers and the replay.
 
-    During each step of the simulations it makes ``updates_per_step`` updates on what was seen
-    before. The updates use one thread; a second one speeds up the physics more than these matrix
+    During each step of the simulations it makes ``updates_per_step`` updates from earlier steps.
+    The updates use one thread, since further threads speed up the physics more than these matrix
     products.
 
     Args:
-        env: what the policy acts in, for sizes, reward terms and warm start.
+        env: environment of the policy: gives sizes, reward terms and warm start.
         cfg: settings.
         seed: the run's seed.
-        total_frames: length of the training.
-        replay_folder: where the replay is kept, or None to keep it in memory.
-        device: where the networks are.
-        num_threads: with more than one, updates and physics overlap.
+        total_frames: length of the training, environment steps.
+        replay_folder: folder of the replay, or None to keep it in memory.
+        device: device of the networks.
+        num_threads: if above 1, updates and physics overlap.
     """
 
     def __init__(
@@ -162,10 +163,10 @@ class SACLearner:
         self._logged: list[dict[str, Tensor]] = []
 
     def during_step(self) -> None:
-        """Make the updates of one step.
+        """Make the updates of one control step.
 
         Raises:
-            RunError: if a loss is not finite; the step is then not taken.
+            RunError: if a loss is not finite; that gradient step is not taken.
         """
         if len(self._replay) < self.cfg.warmup_steps * self._env.num_envs:
             return
@@ -173,9 +174,10 @@ class SACLearner:
             self._update()
 
     def after_step(self, step: Mapping[str, Any]) -> None:
-        """Append a step to the replay, and its observations to their statistics.
+        """Append a step to the replay and update the observation statistics.
 
-        Simulations that diverged are left out: what their actions led to is not known.
+        Truncated rows, simulations that diverged, stay out of the replay: their next state is
+        unknown.
         """
         self.model.normalizer.update(step["observation"].to(self.model.device))
         after = step["next"]
@@ -193,7 +195,7 @@ class SACLearner:
         self._replay.append({name: column[known] for name, column in columns.items()})
 
     def learn(self, rollout: TensorDict) -> dict[str, float]:
-        """Return the means of what the iteration's updates logged.
+        """Return means, over the iteration's updates, of the metrics to log.
 
         Raises:
             RunError: if a weight is no longer finite.
@@ -302,7 +304,7 @@ class SACLearner:
             self.model.device.type, dtype=torch.bfloat16, enabled=self._in_bfloat16
         )
 
-    @cached_property  # found out once, not at every update
+    @cached_property  # determined once, not at every update
     def _in_bfloat16(self) -> bool:
         return self.cfg.bfloat16 and has_bfloat16(self.model.device.type)
 
@@ -316,7 +318,7 @@ class SACLearner:
 def has_bfloat16(device: str) -> bool:
     """Return whether a device (``cpu``, ``cuda``) has instructions for bfloat16.
 
-    Without them torch emulates its products: an update takes many times as long as in float32.
+    Without them torch emulates bfloat16, and an update takes many times as long as in float32.
     """
     if device == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)

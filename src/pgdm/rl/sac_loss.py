@@ -21,7 +21,10 @@ from pgdm.rl.torch_state import drawing_from
 
 
 class DiscountedTD0(TD0Estimator):
-    """The one-step target r + gamma d V', d being the environment's ``discount`` (M, 1), or 1."""
+    """The one-step target r + gamma d V', with the environment's ``discount`` d (M, 1), or d = 1.
+
+    V' is 0 after a termination.
+    """
 
     def value_estimate(self, tensordict: Any, *args: Any, **kwargs: Any) -> Tensor:
         """Return the target, (M, 1)."""
@@ -34,18 +37,26 @@ class DiscountedTD0(TD0Estimator):
 
 
 class SoftActorCriticLoss(SACLoss):
-    """`SACLoss` whose two halves are computed separately, with draws from its own random stream.
+    """`SACLoss` with its own random stream; critics and policy have separate methods.
+
+    With critics Q_i, target critics Q'_i, temperature alpha, target entropy H, the policy's actions
+    a ~ pi(s) and a' ~ pi(s'), and y the target of `DiscountedTD0` with
+    V' = min_i Q'_i(s', a') - alpha log pi(a'|s'):
+
+    critics: sum_i mean((Q_i - y)^2) at replayed actions;
+    policy: mean(alpha log pi(a|s) - min_i Q_i(s, a));
+    temperature: -log(alpha) mean(log pi(a|s) + H).
 
     The critics are evaluated one after the other, not under vmap; benchmark/throughput.py compares
     the two.
 
     Args:
         policy: the actor.
-        critics: the critics, of one shape.
+        critics: the critics, all of the same shape.
         gamma: discount per control step.
-        temperature: weight of the entropy at the start.
-        target_entropy: entropy of the policy that the temperature aims at, nat.
-        generator: stream of the actions that the losses sample.
+        temperature: alpha at the start.
+        target_entropy: H, nat.
+        generator: random stream of the actions that the losses sample.
     """
 
     log_alpha: torch.nn.Parameter
@@ -83,17 +94,17 @@ class SoftActorCriticLoss(SACLoss):
             target_entropy=target_entropy,
             deactivate_vmap=True,
         )
-        estimator: Any = DiscountedTD0  # TorchRL takes a class as well as a name
+        estimator: Any = DiscountedTD0  # TorchRL accepts a class instead of a name
         self.make_value_estimator(estimator, value_network=None, gamma=gamma)
         self._generator = generator
 
     def steer_to(self, entropy: float) -> None:
-        """Change the entropy that the temperature aims at, nat."""
+        """Change the target entropy, nat."""
         target: Any = self.target_entropy  # a buffer
         target.fill_(entropy)
 
     def critic_loss(self, batch: TensorDict) -> Tensor:
-        """Return the squared error () of all critics, summed over them."""
+        """Return the mean squared error () of the critics, summed over them."""
         with drawing_from(self._generator, self.log_alpha.device):
             return self.qvalue_v2_loss(batch)[0]
 

@@ -14,10 +14,10 @@ T = TypeVar("T")
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use ``count`` threads inside.
+    """Let torch use ``count`` threads inside the block.
 
-    While simulations step, torch gets one: its helper threads keep a core spinning for about
-    4 ms after each call (libgomp), and the simulation's own threads need that core.
+    While simulations step, torch gets one thread: its helper threads (libgomp) keep their cores
+    busy for about 4 ms after each call, and the simulation's threads need these cores.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(count)
@@ -29,9 +29,9 @@ def torch_threads(count: int) -> Iterator[None]:
 
 @contextmanager
 def drawing_from(generator: torch.Generator, device: torch.device | None = None) -> Iterator[None]:
-    """Redirect draws from torch's global stream to this generator inside.
+    """Let draws from torch's global stream come from ``generator`` inside the block.
 
-    TorchRL's policies and losses can only draw from the global stream. The stream of a CUDA
+    TorchRL's policies and losses can draw from the global stream only. The stream of a CUDA
     ``device`` cannot be replaced, so it is seeded from the generator instead.
     """
     cuda = device is not None and device.type == "cuda"
@@ -44,7 +44,7 @@ def drawing_from(generator: torch.Generator, device: torch.device | None = None)
 
 
 class Aside:
-    """A second thread for work that can overlap with the caller's; torch has one thread in it.
+    """A second thread for work that can overlap with the caller's; torch uses one thread there.
 
     Args:
         name: name of the thread.

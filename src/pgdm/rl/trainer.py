@@ -35,7 +35,7 @@ class TrainerCfg:
     """Settings of a training run, apart from its environment."""
 
     algo: AlgoCfg
-    """Settings of the learner; their class selects it."""
+    """Settings of the learner; their class selects the learner."""
     seed: int
     """The run's seed."""
     total_frames: int
@@ -69,7 +69,7 @@ class Extras:
     replay_folder: Path | None = None
     """Where an off-policy learner stores its replay; None: in memory, which cannot be resumed."""
     metadata: dict[str, Any] = field(default_factory=dict)
-    """Plain values stored in each checkpoint, such as the run's identity."""
+    """Plain values stored in each checkpoint, such as the versions of libraries."""
 
 
 _STATE = {
@@ -83,7 +83,7 @@ _MISFITS = (
     *(LookupError, ValueError, TypeError, AttributeError, RuntimeError),
     *(AssertionError, ArithmeticError, PgdmError),
 )
-"""What torch, TorchRL and the simulator raise for states that are not theirs."""
+"""What torch, TorchRL and the simulator raise for states that do not fit."""
 
 
 def check_state(state: State) -> None:
@@ -94,7 +94,7 @@ def check_state(state: State) -> None:
     """
     for name, kind in _STATE.items():
         if not isinstance(state.get(name), kind):
-            raise CheckpointError(f"it is no state of a run: '{name}' is missing or wrong")
+            raise CheckpointError(f"it is not the state of a run: '{name}' is missing or wrong")
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Outcome:
 
 
 class Trainer:
-    """Trains a policy on an environment, with the learner that ``cfg.algo`` is for.
+    """Trains a policy on an environment, with the learner that ``cfg.algo`` selects.
 
     All randomness comes from named streams of ``cfg.seed``, and ``state_dict`` holds all that the
     next iteration depends on: a run that was stopped and resumed equals one that never
@@ -170,7 +170,7 @@ class Trainer:
         """Train until ``total_frames``, the time limit or the stop flag.
 
         Raises:
-            RunError: if a reward, observation, loss or gradient is not finite.
+            RunError: if a reward, observation, loss, gradient or weight is not finite.
             CheckpointError: if a checkpoint cannot be written.
         """
         status = "failed"
@@ -227,7 +227,7 @@ class Trainer:
     def _evaluate(self) -> None:
         assert self.extras.evaluation is not None
         metrics = self.extras.evaluation.evaluate(self.model, self.extras.stop)
-        if metrics is None:  # stopped: repeated when the training is resumed
+        if metrics is None:  # stopped: the resumed run repeats the evaluation
             return
         self._evaluated_at, self._last_evaluation = self._frames, metrics
         self._advance_clock()
@@ -286,7 +286,7 @@ class Trainer:
         """Continue from ``state_dict``.
 
         Raises:
-            CheckpointError: if the state is of other networks or incomplete.
+            CheckpointError: if the state is incomplete or belongs to other networks.
         """
         check_state(state)
         mine, other = asdict(self._learner.model.cfg), state["network"]

@@ -1,4 +1,4 @@
-"""What collector and learners need of an environment."""
+"""The interface that collector and learners need of an environment."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class FinishedEpisodes(Protocol):
         ...
 
     def with_later(self, later: Sequence[Self]) -> Self:
-        """Return these episodes and others as one, in this order."""
+        """Return one object with these episodes, then the later ones."""
         ...
 
 
@@ -27,8 +27,8 @@ class VecEnv(Protocol):
     """N copies of one task, stepped together.
 
     All tensors are on ``device``, and those returned are not changed later. After ``terminated``
-    there is no future reward to estimate. After ``truncated`` the episode could have continued:
-    the value of ``info["final_obs"]`` stands for the rest.
+    nothing is bootstrapped. After ``truncated`` the episode could have continued: bootstrap from
+    the value of ``info["final_obs"]``.
     """
 
     num_envs: int
@@ -38,7 +38,7 @@ class VecEnv(Protocol):
     action_dim: int
     """A, numbers in an action."""
     device: torch.device
-    """Device of all tensors but those of ``state_dict``, which are on the CPU."""
+    """Device of all tensors except those in ``state_dict``, which are on the CPU."""
 
     def reset(self) -> Tensor:
         """Restart all simulations; return observations (N, D) float32."""
@@ -48,12 +48,12 @@ class VecEnv(Protocol):
         """Take one control step with actions (N, A) float32; the environment clips them.
 
         Returns:
-            obs (N, D) float32, for finished rows the one after the restart; reward (N,) float32;
+            obs (N, D) float32, for finished rows the first after the restart; reward (N,) float32;
             terminated (N,) bool; truncated (N,) bool; info with ``final_obs`` (N, D), for
-            finished rows the last observation before the restart, ``episodes``, the
-            `FinishedEpisodes` in the order of their rows, or None, and {name: (N,)} of the
-            reward terms, ``raw_terms`` before and ``terms`` after weighting; maybe ``discount``
-            (N,) in [0, 1], a factor on all that follows the step, None for 1.
+            finished rows the last observation before the restart; ``episodes``, the
+            `FinishedEpisodes` in the order of their rows, or None; the reward terms {name: (N,)}
+            before (``raw_terms``) and after (``terms``) weighting; and optionally ``discount``
+            (N,) in [0, 1], a factor on everything after the step, by default 1.
         """
         ...
 

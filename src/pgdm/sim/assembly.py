@@ -15,7 +15,7 @@ from pgdm.library.published_masses import RATIOS
 if TYPE_CHECKING:
     from pgdm.sim.scene import HandCfg, PlacementCfg, SimCfg, TaskCfg
 
-# The friction of the randomised contact geom overrides that of what it touches (released code).
+# Contact priority by which the randomised geom's friction overrides the other's (released code).
 RANDOMIZED_PRIORITY = 10
 
 
@@ -54,7 +54,7 @@ def assemble(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> Ass
 def add_objects(
     spec: mujoco.MjSpec, library: Library, task: TaskCfg, sim: SimCfg
 ) -> tuple[dict[str, Path], str | None]:
-    """Attach the objects of a task to an uncompiled scene, and place what the task places.
+    """Attach the objects of a task to an uncompiled scene and apply the task's placements.
 
     Returns:
         Prefix of each object's names -> the folder of its files, and the randomised geom's name.
@@ -80,8 +80,8 @@ def add_objects(
 def scale_mass(spec: mujoco.MjSpec, ratio: float) -> None:
     """Scale mass and inertia of all bodies of an uncompiled model, in place.
 
-    In a compiled model ``mj_setConst`` would not update ``stat.meaninertia``, on which the solver's
-    tolerance depends.
+    Scaling a compiled model would not do: ``mj_setConst`` does not update ``stat.meaninertia``, on
+    which the solver's tolerance depends.
     """
     for geom in spec.geoms:
         if np.isnan(geom.mass):
@@ -99,7 +99,7 @@ def load(file: Path) -> mujoco.MjSpec:
     """Read a model of the library.
 
     Raises:
-        SceneError: if it is damaged; says how to replace it.
+        SceneError: if it is damaged; the message says how to replace it.
     """
     try:
         return mujoco.MjSpec.from_file(str(file))
@@ -128,7 +128,11 @@ def place(spec: mujoco.MjSpec, placement: PlacementCfg) -> None:
 
 
 def randomized_geom(spec: mujoco.MjSpec, task: TaskCfg) -> str:
-    """Return the name of the tracked body's contact geom, and raise its contact priority."""
+    """Return the name of the tracked body's contact geom, and raise its contact priority.
+
+    Raises:
+        SceneError: if the body does not have exactly one contact geom.
+    """
     body = spec.body(task.tracked_body)
     geoms = [] if body is None else [g for g in body.geoms if g.contype or g.conaffinity]
     if len(geoms) != 1:

@@ -44,15 +44,15 @@ class SimState:
     def of(
         cls, qpos: Tensor, qvel: Tensor, pos: Tensor, quat: Tensor, cvel: Tensor, com: Tensor
     ) -> SimState:
-        """Return the state from MuJoCo's quantities of the points' bodies, then of the object's.
+        """Return the state from MuJoCo's quantities of P points' bodies, then the object's body.
 
         Args:
             qpos: (n, nq).
             qvel: (n, nv).
             pos: (n, P+1, 3) m, centres of the points' geoms, then the object's centre of mass.
             quat: (n, P+1, 4) wxyz.
-            cvel: (n, P+1, 6) angular, then linear velocity at the centre of mass of the tree.
-            com: (n, P+1, 3) m, that centre of mass.
+            cvel: (n, P+1, 6) angular rad/s, then linear velocity m/s at ``com``.
+            com: (n, P+1, 3) m, centre of mass of the kinematic tree to which the body belongs.
         """
         angular, linear_at_com = cvel[..., :3], cvel[..., 3:]
         vel = torch.cat((linear_at_com + torch.linalg.cross(angular, pos - com), angular), -1)
@@ -88,7 +88,7 @@ class Simulations(Protocol):
 
     @property
     def bytes_each(self) -> int:
-        """Memory of the host that each simulation takes."""
+        """Host memory of each simulation, bytes."""
         ...
 
     def data(self, sim: int) -> mujoco.MjData:
@@ -96,7 +96,7 @@ class Simulations(Protocol):
         ...
 
     def reset(self, ids: Array, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Reset simulations ids (k,)."""
+        """Reset simulations ids (k,) to qpos (nq,) and qvel (nv,)."""
         ...
 
     def step(self, ctrl: Array) -> Array:
@@ -108,7 +108,7 @@ class Simulations(Protocol):
         ...
 
     def restore(self, rows: Array) -> None:
-        """Restore a copy of ``rows``."""
+        """Restore all simulations from an earlier copy of ``rows``."""
         ...
 
     def variation(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -118,7 +118,7 @@ class Simulations(Protocol):
     def set_variation(
         self, ids: np.ndarray, friction: np.ndarray, half_width: np.ndarray, mass: np.ndarray
     ) -> None:
-        """Set the object's friction (k, 3), half-width (k,) m and mass (k,) kg in simulations."""
+        """Set the object's friction (k, 3), half-width (k,) m and mass (k,) kg in ids (k,)."""
         ...
 
 
@@ -169,7 +169,7 @@ class SimBatch:
     def bytes_each(self) -> int:
         """Memory of one simulation in its present state, bytes."""
         arrays = (self.rows, *self._f.values(), *self._d.values())
-        data = self.data(0)  # each has its own, with an arena for contacts
+        data = self.data(0)  # each simulation has an MjData, with an arena for contacts
         return sum(a.nbytes for a in arrays) // self.num_envs + data.nbuffer + data.maxuse_arena
 
     def data(self, sim: int) -> mujoco.MjData:
@@ -188,13 +188,13 @@ class SimBatch:
     def step(self, ctrl: Array) -> np.ndarray:
         """Take one control step with targets of the hand's driven joints ctrl (N, nu), m and rad.
 
-        Gravity is compensated by qfrc_applied = qfrc_bias of the compensated joints at the start of
-        the step, held for its substeps (released code).
+        Gravity compensation (released code): for the compensated joints, qfrc_applied is set to
+        qfrc_bias (gravity and Coriolis forces) at the start of the step, for all substeps.
 
         Returns:
             Whether each simulation diverged, (N,) bool: MuJoCo raised an error or a warning (bad
             position, velocity or acceleration, no memory for contacts). The state of a diverged
-            simulation is meaningless; the others are unaffected.
+            simulation is meaningless; other simulations are unaffected.
         """
         n = self._compensated
         self._f["ctrl"][:, self._actuators] = ctrl
@@ -234,7 +234,7 @@ class SimBatch:
         return self._d["xipos"][:, body].copy(), self._d["xquat"][:, body].copy()
 
     def push(self, body: int, force: np.ndarray, point: np.ndarray) -> None:
-        """Apply forces (N, 3) N to a body at points (N, 3) m, world frame, until a reset."""
+        """Apply forces (N, 3) N to a body at points (N, 3) m, world frame, until the next reset."""
         arm = point - self._d["xipos"][:, body]
         self._f["xfrc_applied"][:, body] = np.concatenate((force, np.cross(arm, force)), 1)
 
@@ -242,7 +242,7 @@ class SimBatch:
         """Restore the bit-exact state of rows (N, nstate) copied from ``rows`` earlier.
 
         Raises:
-            SceneError: if the rows have another shape and so belong to another scene.
+            SceneError: if the rows have the wrong shape, that of another scene.
         """
         if rows.shape != self.rows.shape:
             raise SceneError(

@@ -7,9 +7,9 @@ import math
 import mujoco
 import numpy as np
 
-# Viewing directions about the vertical; 90 looks along +y. The hand approaches from -y over the
-# centre of the table: from the front right, the fingers do not hide the object. The others are
-# alternatives for scenes in which a board or a door blocks the view.
+# MuJoCo's camera azimuths, in order of preference; 90 looks along +y. The hand approaches from -y
+# over the centre of the table; seen from the front right, the fingers do not hide the object. The
+# others are for scenes in which a board or a door blocks that view.
 AZIMUTHS_DEG = (-125.0, -55.0, 180.0, 0.0, 125.0, 55.0)
 ELEVATION_DEG = -22.0
 ROOM_M = 0.2
@@ -19,7 +19,7 @@ MIN_HEIGHT_M = 0.6
 MIDDLE = np.array([[0.0, -0.05, 0.15]])
 """Point shown without a motion: above the centre of the table, world frame, m."""
 _RAYS = 12  # points of a motion tested for visibility
-_SURFACES = 40  # most surfaces a ray is followed through
+_SURFACES = 40  # surfaces after which a ray is no longer followed
 
 
 def camera_for(
@@ -79,7 +79,7 @@ def _axes(azimuth_deg: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _movers(model: mujoco.MjModel, object_body: int) -> np.ndarray:
-    """Return a mask (ngeom,) of the geoms of hand and object, which do not stay in the way."""
+    """Return a mask (ngeom,) of the geoms of hand and object, which move and may block the view."""
     joints = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
     hands = np.unique(model.body_rootid[model.jnt_bodyid[joints]])
     of_hand = np.isin(model.body_rootid, hands)

@@ -17,14 +17,14 @@ class HandContact:
     """Penetration of a scene's hand into everything else: table, object, board, door.
 
     Args:
-        scene: a scene, whose hand's joints are first in qpos.
+        scene: a scene; its hand's joints are first in qpos.
     """
 
     def __init__(self, scene: Scene) -> None:
         model, hand = scene.model, scene.hand
         self._model, self._data = model, mujoco.MjData(model)
         self.first_finger_joint = hand.num_base_joints + hand.num_wrist_joints
-        """Index of the first finger joint in qpos; finger joints run from here to n."""
+        """Index of the first finger joint in qpos; finger joints are the last of the hand's."""
         joints = model.jnt_bodyid[: scene.index.num_joints]
         of_hand = np.isin(model.body_rootid, model.body_rootid[joints])
         self._of_hand = of_hand[model.geom_bodyid]
@@ -60,13 +60,13 @@ class HandContact:
     def overlap(self, qpos: np.ndarray, clearance_m: float) -> float:
         """Return the sum of max(0, clearance - distance) over the hand's contacts at qpos (nq,), m.
 
-        MuJoCo reports contacts only within the margins of the geoms, so that a larger clearance has
-        no effect.
+        MuJoCo reports contacts only within the geoms' margins; a clearance above them has no
+        further effect.
         """
         return self.too_near(self._at(qpos), clearance_m)
 
     def too_near(self, data: mujoco.MjData, clearance_m: float) -> float:
-        """Return `overlap` for a state with current contacts."""
+        """Return the same as `overlap`, m, for a state with current contacts."""
         dist = self._near(data, clearance_m)[1]
         return float((clearance_m - dist).sum())
 
@@ -89,7 +89,7 @@ class HandContact:
 
 
 class FingertipDistance:
-    """Distance between the surfaces of each finger's last link and of the object.
+    """Distance from the surface of each finger's last link to the object's surface.
 
     Args:
         scene: scene of the task.
@@ -109,7 +109,7 @@ class FingertipDistance:
             self._links.append(np.flatnonzero(solid & (model.geom_bodyid == body)).tolist())
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
-        """Return the distances (F,) m of a state with current kinematics, negative inside."""
+        """Return the distances (F,) m of a state with current kinematics, negative on overlap."""
         return np.array([self._least(data, link) for link in self._links])
 
     def _least(self, data: mujoco.MjData, link: list[int]) -> float:

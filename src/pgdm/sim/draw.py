@@ -1,4 +1,4 @@
-"""Drawing in a process of its own, so that a graphics driver never ends the caller."""
+"""Drawing in a child process, so that a crashing graphics driver cannot kill the caller."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pgdm.sim.render import Renderer
 
 SIZE = (640, 480)
 """Width and height of the pictures, pixels."""
-_SILENT_S = 120.0  # a driver that takes this long for a picture hangs
+_SILENT_S = 120.0  # time per picture after which the driver is considered hung
 _MODEL = "model.mjb"
 
 _broken: dict[str, str] = {}  # backends that drew nothing, with reasons; not tried again
@@ -34,21 +34,22 @@ class Shots:
     object_body: int
     """Id of the tracked body."""
     motion: np.ndarray
-    """Points that the picture covers, (T, 3) m, world frame."""
+    """Points that a fixed camera keeps in view, (T, 3) m, world frame."""
     qpos: np.ndarray
     """(K, nq)."""
     captions: Sequence[str]
     """Text of each picture, (K,)."""
     goals: tuple[np.ndarray, np.ndarray] | None = None
-    """Poses of the ghost: centre of mass (K, 3) m and orientation (K, 4) wxyz, world frame."""
+    """Targets, drawn as a translucent object: centre of mass (K, 3) m and orientation (K, 4) wxyz,
+    world frame."""
     marks: Sequence[np.ndarray] | None = None
-    """Points (n, 3) m, world frame, to show as small spheres in each picture, (K,)."""
+    """For each of K pictures, points (n, 3) m, world frame, to show as small spheres."""
     follow_m: float | None = None
     """Height of the world shown by a camera that follows the object, m; None: a fixed camera."""
 
 
 def draw(shots: Shots) -> Iterator[np.ndarray]:
-    """Draw in another process, with the first OpenGL backend that works; yields (H, W, 3) uint8.
+    """Yield pictures (H, W, 3) uint8, drawn in a child process with the first working backend.
 
     Raises:
         RenderError: if none works.
@@ -83,7 +84,7 @@ def _drawn_with(backend: str, shots: Shots, first: int) -> Iterator[np.ndarray]:
             stdout=subprocess.PIPE,
             stderr=errors,
             env=gl.environment(backend),
-            start_new_session=True,  # Ctrl-C is for the caller
+            start_new_session=True,  # so that Ctrl-C reaches the caller only
         )
         try:
             for _ in shots.qpos[first:]:
@@ -112,7 +113,7 @@ def _read(child: subprocess.Popen[bytes], size: int, errors: IO[bytes]) -> bytes
 
 
 def _write(task: IO[bytes], shots: Shots, first: int) -> None:
-    """Write what the other process needs as an ``.npz``, from picture ``first`` on."""
+    """Write what the child process needs as an ``.npz``, from picture ``first`` on."""
     model = np.empty(mujoco.mj_sizeModel(shots.model), np.uint8)
     mujoco.mj_saveModel(shots.model, None, model)
     arrays: dict[str, Any] = {
@@ -132,7 +133,7 @@ def _write(task: IO[bytes], shots: Shots, first: int) -> None:
 
 
 def main() -> None:
-    """Draw what is on stdin; write the pictures to stdout, as bytes one after the other."""
+    """Draw the shots on stdin; write the pictures' raw bytes to stdout."""
     from mujoco.gl_context import GLContext  # of the backend that MUJOCO_GL names
 
     pipe = os.dup(sys.stdout.fileno())

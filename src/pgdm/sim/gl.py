@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 @contextlib.contextmanager
 def deferred() -> Iterator[None]:
-    """Hide a ``MUJOCO_GL`` with which the import of MuJoCo would fail; `backends` still reads it.
+    """Hide a ``MUJOCO_GL`` that would make importing MuJoCo fail; `backends` still reads it.
 
     MuJoCo loads OpenGL when it is imported. A command that draws nothing does not need it, and
     a run can draw its videos with another backend.
@@ -61,10 +61,10 @@ def deferred() -> Iterator[None]:
 
 
 def backends() -> list[str]:
-    """Return the OpenGL backends to try, the user's own choice first.
+    """Return the OpenGL backends to try, the user's choice first.
 
-    ``MUJOCO_GL`` names it, or PyOpenGL's ``PYOPENGL_PLATFORM``. On Linux EGL, OSMesa and GLFW
-    follow; elsewhere the only one is "", MuJoCo's own choice.
+    The user chooses with ``MUJOCO_GL`` or PyOpenGL's ``PYOPENGL_PLATFORM``. On Linux the rest of
+    EGL, OSMesa and GLFW follow; elsewhere the only backend is "", which leaves MuJoCo the choice.
 
     Raises:
         RenderError: if ``MUJOCO_GL`` switches rendering off.
@@ -77,7 +77,7 @@ def backends() -> list[str]:
         return [""]
     wanted = "glfw" if wanted == "glx" else wanted
     if wanted not in (*_BACKENDS, *_ANY):
-        _warn(f"MUJOCO_GL is '{value}', which names no OpenGL; valid: {_VALID}")
+        _warn(f"MUJOCO_GL is '{value}', which is not a known backend; valid: {_VALID}")
     first = wanted if wanted in _BACKENDS else os.environ.get("PYOPENGL_PLATFORM", "").lower()
     return sorted(_BACKENDS, key=lambda backend: backend != first)
 
@@ -91,14 +91,14 @@ def environment(backend: str) -> dict[str, str]:
 
 
 def note_failures(reasons: Mapping[str, str], used: str) -> None:
-    """Tell the user, once, that a backend was taken in place of the one that MUJOCO_GL names."""
+    """Warn once if the backend that MUJOCO_GL names failed and ``used`` replaces it."""
     wanted = os.environ.get(_HIDDEN, os.environ.get("MUJOCO_GL", "")).lower().strip()
     if wanted in reasons:
         _warn(f"MUJOCO_GL={wanted} does not work here ({reasons[wanted]}); drawing with {used}")
 
 
 def no_opengl(reasons: Mapping[str, str]) -> RenderError:
-    """Return the error for a machine on which no backend works, by backend and reason."""
+    """Return the error for a machine on which no backend works, given each backend's reason."""
     listed = "; ".join(f"{name or sys.platform}: {reason}" for name, reason in reasons.items())
     return RenderError(f"no OpenGL to render with ({listed}); {CURE}")
 
@@ -107,15 +107,15 @@ def no_opengl(reasons: Mapping[str, str]) -> RenderError:
 def context_class() -> type[Any]:
     """Return MuJoCo's OpenGL context class for the first of `backends` that works here.
 
-    Each is tried in a process of its own: PyOpenGL binds permanently to one of them at its first
-    import, and a broken driver must not crash this process.
+    Each backend is tried in a child process: PyOpenGL binds permanently to a backend when it is
+    first imported, and a broken driver must not crash this process.
 
     Raises:
-        RenderError: if none works; names the packages to install.
+        RenderError: if none works; the message names the packages to install.
     """
     tried = backends()
-    # Mesa's software renderer and torch's GPU compiler both bundle LLVM: loaded after Mesa's, the
-    # compiler's crashes the process (Mesa 22.3, triton 3.9); loaded before it, both work.
+    # Mesa's software renderer and triton, torch's GPU compiler, both bundle LLVM. Loading triton
+    # after Mesa crashes the process (Mesa 22.3, triton 3.9); loading it first works.
     with contextlib.suppress(ImportError):
         importlib.import_module("triton")
     reasons: dict[str, str] = {}
@@ -152,7 +152,7 @@ def _why_not(backend: str) -> str | None:
 
 
 def why_ended(code: int, stderr: str) -> str:
-    """Return in a few words why a process that renders ended."""
+    """Return in a few words why a rendering process failed."""
     lines = stderr.strip().splitlines()
     if code < 0:
         return f"its driver crashed (signal {-code})"

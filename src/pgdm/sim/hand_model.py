@@ -1,4 +1,4 @@
-"""What pgdm asks of the model of a hand; docs/extending.md describes it for people."""
+"""Checks of what pgdm requires of a hand's model; docs/extending.md lists the requirements."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ BASE += ("hinge about x", "hinge about y", "hinge about z")
 """The base joints, which move the hand as a whole: first in qpos, all on the mount body."""
 
 RESET_KEY = "reset"
-"""Keyframe of a hand's model with its reset pose; without one all joints are at zero."""
+"""Keyframe of a hand's model with its reset pose; without it, the pose is all joints at zero."""
 
-_COUPLED_RAD = 0.01  # by how much a follower may leave its range
-_SAMPLES = 101  # of a leader's range
+_COUPLED_RAD = 0.01  # tolerance by which a joint may be outside its range, rad or m
+_SAMPLES = 101  # positions of a leader, spread over its range
 
 
 def joint_actuators(model: mujoco.MjModel, hand: HandCfg) -> np.ndarray:
     """Check the model of a hand; return the id of the actuator of each of its joints, (n,).
 
-    It is -1 for a coupled joint. Actuators may come in any order; everywhere else in pgdm their
-    order is that of the joints.
+    The id of a coupled joint is -1. The model's actuators may be in any order; elsewhere in pgdm
+    they are in the order of their joints.
 
     Args:
         model: the compiled scene.
         hand: its hand.
 
     Raises:
-        SceneError: a joint or actuator is not what pgdm assumes; names it.
+        SceneError: if a joint or actuator violates the requirements; the message names it.
     """
     count = _check_joints(model, hand)
     _check_base(model, hand)
@@ -66,10 +66,10 @@ def joint_actuators(model: mujoco.MjModel, hand: HandCfg) -> np.ndarray:
 
 
 def reset_joints(model: mujoco.MjModel, hand: HandCfg, count: int) -> np.ndarray:
-    """Return the reset pose of a hand, (n,) m and rad: that of its keyframe, or all zero.
+    """Return the reset pose of a hand, (n,) m and rad: its keyframe ``RESET_KEY``, or all zero.
 
     Raises:
-        SceneError: the keyframe moves the base, or a joint beyond its range.
+        SceneError: if the keyframe moves the base, or another joint beyond its range.
     """
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, f"{hand.name}/{RESET_KEY}")
     if key < 0:
@@ -89,13 +89,13 @@ def reset_joints(model: mujoco.MjModel, hand: HandCfg, count: int) -> np.ndarray
 
 
 def six_joints(model: mujoco.MjModel, body: int) -> bool:
-    """Return whether the joints of a body are those of `BASE`."""
+    """Return whether a body has exactly the six joints of `BASE`, in that order."""
     first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
     return count == len(BASE) and all(_fits(model, first + i, i) for i in range(count))
 
 
 def _fits(model: mujoco.MjModel, joint: int, number: int) -> bool:
-    """Return whether a joint is the one of that number in `BASE`, at its body's origin."""
+    """Return whether a joint is a ``BASE[number]`` at its body's origin."""
     slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
     along = np.allclose(model.jnt_axis[joint], np.eye(3)[number % 3], atol=1e-6)
     return slides == (number < 3) and along and not model.jnt_pos[joint].any()
@@ -124,8 +124,8 @@ def _check_joints(model: mujoco.MjModel, hand: HandCfg) -> int:
     if count < hand.num_base_joints + hand.num_wrist_joints:
         raise _wrong(
             hand,
-            f"there are {count} joints '{prefix}...', less than hand.num_base_joints "
-            f"{hand.num_base_joints} and hand.num_wrist_joints {hand.num_wrist_joints}; the model "
+            f"there are {count} joints '{prefix}...', fewer than hand.num_base_joints "
+            f"{hand.num_base_joints} plus hand.num_wrist_joints {hand.num_wrist_joints}; the model "
             "must have the hand's name",
         )
     return count
@@ -170,7 +170,9 @@ def _check_couplings(model: mujoco.MjModel, hand: HandCfg, count: int) -> np.nda
         if not model.eq_active0[row]:
             raise _wrong(hand, f"{pair}, but the constraint is not active")
         if min(follower, leader) < len(BASE) or leader >= count or coupled[leader]:
-            raise _wrong(hand, f"{pair}, which must be a finger joint that follows none itself")
+            raise _wrong(
+                hand, f"{pair}; neither may be a base joint, and the latter must not follow another"
+            )
     if len(set(couplings.followers.tolist())) < len(couplings.rows):
         raise _wrong(hand, "a joint follows two others")
     start, end = model.jnt_range[couplings.leaders].T
@@ -183,7 +185,7 @@ def _check_couplings(model: mujoco.MjModel, hand: HandCfg, count: int) -> np.nda
             hand,
             f"joint '{_joint(model, couplings.followers[one])}' leaves its range by "
             f"{over[one]:.3f} when '{_joint(model, couplings.leaders[one])}' goes to the end of "
-            "its own: narrow the leader's range",
+            "its range: narrow the range of the latter",
         )
     return coupled
 
@@ -206,8 +208,8 @@ def _check_servo(model: mujoco.MjModel, hand: HandCfg, actuator: int) -> None:
     if not is_servo:
         raise _wrong(
             hand,
-            f"actuator '{name}' is no position servo; use <position kp=...> with gear 1: actions "
-            "are joint positions",
+            f"actuator '{name}' is not a position servo; use <position kp=...> with gear 1: "
+            "actions are joint positions",
         )
     low, high = model.actuator_ctrlrange[actuator]
     if not (model.actuator_ctrllimited[actuator] and low < high):

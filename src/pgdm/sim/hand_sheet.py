@@ -1,4 +1,4 @@
-"""A picture of one hand above a table: its reset pose and its mean hand, with its points."""
+"""A picture of one hand above a table: reset pose and mean pre-grasp, with its tracked points."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ SIDES = (("from behind", 90.0, -20.0), ("thumb's side", 0.0, -15.0), ("top", 90.
 _TITLE_HEIGHT, _TEXT_SIZE, _MARGIN = 34, 17, 8  # pixels
 _FOVY_DEG, _ROOM_M = 25.0, 0.34
 _WRIST = (0.9, 0.9, 0.1, 1.0)
-_SHOWN = 0.45  # opacity of the hand, so that its points are seen
+_SHOWN = 0.45  # opacity of the hand, so that its points are visible
 
 
 def write_hand_sheet(scene: Scene, mean: np.ndarray, path: Path) -> Path:
-    """Write a PNG: the reset pose above, the mean hand below, from three sides.
+    """Write a PNG: the reset pose above, the mean pre-grasp below, from three sides.
 
-    Points are small balls, one colour for each finger; the wrist's is yellow.
+    Tracked points are small balls, in one colour per finger; the wrist's is yellow.
 
     Args:
         scene: as from :func:`pgdm.sim.scene.bare_scene`; its colours are changed.
-        mean: mean hand (n,).
+        mean: the hand's joints in the mean pre-grasp, (n,) m and rad.
         path: the file to write.
 
     Raises:

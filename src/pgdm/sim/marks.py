@@ -15,6 +15,6 @@ def add_marks(scene: mujoco.MjvScene, points: np.ndarray) -> None:
     for point in points[: scene.maxgeom - scene.ngeom]:
         mark = scene.geoms[scene.ngeom]
         mujoco.mjv_initGeom(mark, mujoco.mjtGeom.mjGEOM_SPHERE, size, point, rotation, MARK_RGBA)
-        mark.emission = 0.6  # visible in the hand's shadow as well
+        mark.emission = 0.6  # visible even in the hand's shadow
         mark.category = mujoco.mjtCatBit.mjCAT_DECOR
         scene.ngeom += 1

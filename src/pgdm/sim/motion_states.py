@@ -12,9 +12,9 @@ from pgdm.sim.scene import Scene
 
 
 def motion_qpos(scene: Scene, start: np.ndarray, reference: ObjectReference) -> np.ndarray:
-    """Return qpos (T, nq) with the object on the exemplar motion, all else as at ``start`` (nq,).
+    """Return qpos (T, nq) with the object on the exemplar motion, all else as in ``start`` (nq,).
 
-    An object without six joints of its own (see `pgdm.sim.hand_model.BASE`) stays too.
+    An object that lacks the six joints of a free object (`pgdm.sim.hand_model.BASE`) stays too.
     """
     model, body = scene.model, scene.index.object_body
     qpos = np.repeat(start[None], len(reference), axis=0)
@@ -40,7 +40,7 @@ def expert_qpos(
     Args:
         scene: scene of the task.
         start: qpos (nq,) of everything else.
-        reference: the exemplar motion, its positions those of the centre of mass.
+        reference: the exemplar motion; its positions are those of the object's centre of mass.
         joints: joint positions of the hand (T, n), m and rad.
     """
     qpos = motion_qpos(scene, start, reference)

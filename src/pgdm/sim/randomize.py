@@ -1,4 +1,4 @@
-"""Randomised object at every reset (paper, App. E: real-world experiment)."""
+"""Randomisation of the object at every reset (paper, App. E: real-world experiment)."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Randomizer:
         self._rng.bit_generator.state = state["rng"]
         self._friction = np.array(state["friction"])
         self._half_width = np.array(state["half_width"])
-        # Runs of earlier versions did not vary the mass.
+        # Checkpoints of earlier versions, which did not randomise the mass, lack it.
         self._mass = np.array(state.get("mass", sim.variation()[2]))
         ids = np.arange(sim.num_envs)
         sim.set_variation(ids, self._friction, self._half_width, self._mass)

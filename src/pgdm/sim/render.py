@@ -20,12 +20,12 @@ from pgdm.sim.marks import add_marks
 
 MAX_GEOMS = 2000
 GHOST_RGBA = np.array([0.15, 0.95, 0.45, 0.35], np.float32)
-HAND_ALPHA = 0.25  # of a hand that would hide marks
-# Software OpenGL: a frame of 640x480 costs about 75 ms with these, 230 ms with the scene's own.
+HAND_ALPHA = 0.25  # opacity of the hand when marks are shown
+# In software OpenGL a 640x480 frame takes 75 ms with these settings, 230 ms with the scene's.
 SHADOW_SIZE = 1024
 SAMPLES = 4
-SHADOW_SCALE = 0.1  # of the light's cone: shadows need not reach beyond the table
-VIDEO_FPS = 25  # control steps per second: videos play in real time
+SHADOW_SCALE = 0.1  # share of the light's cone with shadows: enough for the table
+VIDEO_FPS = 25  # frames per second, one per control step of 0.04 s: real time
 
 
 class Renderer:
@@ -33,14 +33,14 @@ class Renderer:
 
     Args:
         model: the compiled scene.
-        object_body: id of the tracked body; it and all rigidly attached to it form the ghost.
+        object_body: id of the tracked body; the ghost shows it and what is rigidly attached to it.
         width: width of the images, pixels.
         height: height of the images, pixels.
         motion: positions of the object's centre of mass to keep in view, (T, 3) m, usually the
-            exemplar motion; None shows the middle of the table.
+            exemplar motion; None: the middle of the table.
         follow_m: height of the world to show with a camera that follows the object, m; None for a
             fixed camera that shows the whole motion.
-        opengl: MuJoCo's class of OpenGL contexts; None: the first that works here.
+        opengl: MuJoCo's OpenGL context class; None: that of the first backend that works here.
 
     Raises:
         RenderError: if no OpenGL works here.
@@ -58,7 +58,7 @@ class Renderer:
     ) -> None:
         self.model, self.width, self.height = model, width, height
         self._object_body = object_body
-        self._com = model.body_ipos[object_body].copy()  # (3,) m, of the COM in the body's frame
+        self._com = model.body_ipos[object_body].copy()  # (3,) m, COM in the body's frame
         attached = model.body_weldid == model.body_weldid[object_body]
         moves = model.body_weldid != 0
         self._hand_geoms = frozenset(
@@ -167,7 +167,7 @@ class Renderer:
         goal_rot = np.empty(9)
         mujoco.mju_quat2Mat(goal_rot, np.asarray(quat, float))
         goal_rot = goal_rot.reshape(3, 3)
-        goal_pos = np.asarray(com, float) - goal_rot @ self._com  # the target is the COM's
+        goal_pos = np.asarray(com, float) - goal_rot @ self._com  # the target is a pose of the COM
         rotation = goal_rot @ data.xmat[self._object_body].reshape(3, 3).T
         start = data.xpos[self._object_body]
         kind = mujoco.mjtObj.mjOBJ_GEOM
@@ -181,7 +181,7 @@ class Renderer:
             pos = goal_pos + rotation @ (geom.pos - start)
             mat = (rotation @ geom.mat).ravel()
             mujoco.mjv_initGeom(ghost, geom.type, geom.size, pos, mat, GHOST_RGBA)
-            ghost.size[:] = geom.size  # already converted, which initGeom would repeat
+            ghost.size[:] = geom.size  # mjv_initGeom has converted the size a second time
             ghost.dataid = geom.dataid
             ghost.category = mujoco.mjtCatBit.mjCAT_DECOR
             self._scene.ngeom += 1
@@ -209,7 +209,8 @@ def _open(
 def _drawn_cheaply(model: mujoco.MjModel, width: int, height: int) -> Iterator[None]:
     """Replace a model's visual settings while MuJoCo reads them; the physics is unaffected.
 
-    The scene's own off-screen buffer is 3024x1680 with 8 samples: 300 MB in software OpenGL.
+    The off-screen buffer that the scene asks for, 3024x1680 with 8 samples, takes 300 MB in
+    software OpenGL.
     """
     glob, quality, maps = model.vis.global_, model.vis.quality, model.vis.map
     before = glob.offwidth, glob.offheight, quality.offsamples, quality.shadowsize, maps.shadowscale

@@ -20,8 +20,8 @@ OBJECT_MASSES = ("volume", "published")
 WARP = "warp"
 ENGINES = ("mujoco", WARP)
 
-_NEVER_M = 10.0  # no two geoms penetrate this deep
-_FREE_JOINTS = 6  # three slides and three hinges, as in the benchmark
+_NEVER_M = 10.0  # a depth that no penetration reaches
+_FREE_JOINTS = 6  # of a free object: three slides and three hinges
 # Fields of a model that determine its physics.
 _PHYSICS = (
     *("body_pos", "body_quat", "body_mass", "body_inertia", "body_ipos", "body_iquat"),
@@ -36,7 +36,7 @@ _PHYSICS = (
 
 @dataclass(frozen=True)
 class PlacementCfg:
-    """Placement of a body of an object, instead of that in the object's file."""
+    """Pose of an object's body that replaces the pose in the object's file."""
 
     body: str
     """Scene name of the body, such as ``door/frame``."""
@@ -147,14 +147,14 @@ class SceneIndex:
     num_joints: int  # n, of the hand; they are first in qpos
     num_actuators: int  # nu; less than n if joints are coupled
     driven: np.ndarray  # (nu,) the hand's joints that have an actuator, ascending
-    actuators: np.ndarray  # (nu,) id of the actuator of each; targets are in this order
-    couplings: Couplings  # of the other joints, which have none
+    actuators: np.ndarray  # (nu,) their actuators' ids; actuator targets are in this order
+    couplings: Couplings  # of the joints without actuator
     reset: np.ndarray  # (n,) m, rad: the reset pose
     num_compensated: int  # joints with gravity compensation, first in qvel
     num_base_joints: int
     ctrl_low: np.ndarray  # (nu,) m, rad
     ctrl_high: np.ndarray  # (nu,)
-    joint_low: np.ndarray  # (n,) m, rad: control range, or a coupled joint's own range
+    joint_low: np.ndarray  # (n,) m, rad: control range; for a coupled joint its joint range
     joint_high: np.ndarray  # (n,)
     mount_pos: np.ndarray  # (3,) m, world frame, base joints at zero
     mount_quat: np.ndarray  # (4,) wxyz
@@ -203,8 +203,8 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
     """Compile the scene of a task.
 
     Raises:
-        SceneError: if it does not compile, a body, geom or joint is missing, or the hand's model is
-            not what pgdm assumes.
+        SceneError: if it does not compile, a body, geom or joint is missing, or the hand's model
+            violates pgdm's requirements.
         LibraryError: if the library lacks an asset.
     """
     spec, folders, randomized = assemble(library, task, hand, sim)
@@ -217,11 +217,11 @@ def build_scene(library: Library, task: TaskCfg, hand: HandCfg, sim: SimCfg) -> 
 
 
 def bare_scene(model: mujoco.MjSpec, hand: HandCfg) -> Scene:
-    """Compile a hand with a ball on a table, to look at the hand before it has any task.
+    """Compile a hand with a ball on a table, to inspect a hand that has no task yet.
 
     Args:
-        model: the hand's model; it stays as it is.
-        hand: its settings.
+        model: the hand's model; not changed.
+        hand: settings of the hand.
 
     Raises:
         SceneError: as for :func:`build_scene`.
@@ -238,16 +238,16 @@ def bare_scene(model: mujoco.MjSpec, hand: HandCfg) -> Scene:
 
 
 def hand_alone(scene: Scene) -> Scene:
-    """Return the scene with contacts of the objects, and of what they hang on, switched off.
+    """Return the scene without contacts of the objects' models, such as a door and its frame.
 
-    They remain in the model, so that its state has the same layout.
+    The bodies remain in the model, so that its state has the same layout.
     """
     model = copy.deepcopy(scene.model)
     bodies = [model.body(i).name.startswith(scene.object_prefixes) for i in range(model.nbody)]
     of_object = np.array(bodies)[model.geom_bodyid]
     model.geom_contype[of_object] = model.geom_conaffinity[of_object] = 0
-    # Explicit contact pairs ignore contype, but produce no force at a margin of -10 m. With the gap
-    # they are detected as before; for some shapes MuJoCo takes a negative margin as a depth.
+    # Explicit contact pairs ignore contype, but produce no force at a margin of -10 m. The gap
+    # keeps their detection as before: for some shapes MuJoCo misreads a negative detection margin.
     named = of_object[model.pair_geom1] | of_object[model.pair_geom2]
     model.pair_margin[named], model.pair_gap[named] = -_NEVER_M, _NEVER_M
     return replace(scene, model=model)

@@ -1,4 +1,4 @@
-"""Motions in a window, with MuJoCo's own viewer."""
+"""Motions in a window of MuJoCo's viewer."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def show_motion(
     Args:
         model: the compiled scene.
         qpos: joint positions (T, nq) at the control steps.
-        marks: points (n, 3) m to show as small spheres at each step.
+        marks: for each of T steps, points (n, 3) m, world frame, to show as small spheres.
 
     Raises:
         RenderError: if no window can be opened.
@@ -50,7 +50,7 @@ class Window:
 
     Args:
         model: the compiled scene.
-        instead: what the user may do where no window can be opened, for the message.
+        instead: what to use if no window can be opened, for the error message.
 
     Raises:
         RenderError: if no window can be opened.
@@ -68,21 +68,21 @@ class Window:
             raise RenderError(f"cannot open a window ({error}); use {instead}") from error
         own = set(threading.enumerate()) - before
         self.close = weakref.finalize(self, _close, self._viewer, own)
-        """Closes it; also when the program ends, before the viewer's own exit handlers run."""
+        """Close the window; also runs when the program ends, before the viewer's exit handlers."""
         atexit.register(self.close)
 
     @property
     def is_open(self) -> bool:
-        """Whether it has not been closed, by the user or by ``close``."""
+        """Whether neither the user nor ``close`` has closed the window."""
         return self._viewer.is_running()
 
     def show(self, qpos: np.ndarray, period_s: float, marks: np.ndarray | None = None) -> None:
-        """Show a state, no sooner than a time after the last one.
+        """Show a state, at least ``period_s`` after the last state.
 
         Args:
             qpos: joint positions (nq,).
-            period_s: the least time between two states.
-            marks: points (n, 3) m to show as small spheres.
+            period_s: least time between two states, s.
+            marks: points (n, 3) m, world frame, to show as small spheres.
         """
         time.sleep(max(0.0, self._shown_s + period_s - time.monotonic()))
         self._shown_s = time.monotonic()
@@ -97,7 +97,7 @@ class Window:
 
 def _close(window: viewer.Handle, threads: set[threading.Thread]) -> None:
     window.close()
-    for thread in threads:  # a program that ends before them crashes
+    for thread in threads:  # the program would crash if it ended before them
         thread.join(_CLOSE_S)
 
 

@@ -1,11 +1,11 @@
 """N simulations of one scene on one device, stepped by MuJoCo Warp, float32; an optional extra.
 
-A control step, that is all substeps and the quantities that are read afterwards, is one captured
-graph. States are torch views of Warp's arrays: nothing is copied to the host. Resets write the
-rows of the simulations concerned and leave the others as they are. Torch and Warp both use the
-device's default stream, which keeps the order of their work.
+A control step, with all its substeps and the quantities read afterwards, is one captured graph.
+States are torch views of Warp's arrays: nothing is copied to the host. A reset writes only the rows
+of its simulations. Torch and Warp both use the device's default stream, which keeps their work in
+order.
 
-On the CPU, Warp's results are the same in every run; on a GPU the order of its sums varies.
+Warp's results are reproducible on the CPU, but not on a GPU, where the order of summation varies.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pgdm.sim.scene import Scene
 try:
     import warp as wp
 
-    wp.config.log_level = wp.LOG_WARNING  # before mujoco_warp starts it
+    wp.config.log_level = wp.LOG_WARNING  # before mujoco_warp initialises Warp
     import mujoco_warp as mjw
 except ImportError as error:
     raise ConfigError(
@@ -34,7 +34,7 @@ except ImportError as error:
     ) from error
 
 # Largest values over random rollouts of five scenes: 71 contacts and 462 constraint rows; means
-# are below 11 and 94. Contacts are one pool for all simulations, rows a limit of each.
+# are below 11 and 94. All simulations share one pool of contacts; the limit of rows is for each.
 _CONTACTS_PER_SIM = 48
 _CONSTRAINT_ROWS = 512
 
@@ -67,7 +67,7 @@ class WarpBatch:
             self._step, self._refresh = self._captured(self._substep), self._captured(self._update)
 
     def _build(self) -> None:
-        """Upload model and state, and take the views of them that are read and written."""
+        """Upload model and state, and create the torch views that are read and written."""
         scene, n = self.scene, self.num_envs
         varied: dict[str, int] = {}
         if scene.index.randomized_geom is not None:
@@ -85,7 +85,7 @@ class WarpBatch:
             raise SceneError(
                 f"MuJoCo Warp cannot simulate task '{scene.task.id}': {error}; choose sim=default"
             ) from error
-        self._model.opt.warn_overflow = False  # counted here instead
+        self._model.opt.warn_overflow = False  # `step` checks for overflow instead
         view = {name: wp.to_torch(getattr(self._data, name)) for name in {*_STATE, *_READ}}
         self._state = {name: view[name] for name in _STATE}
         self._read = {name: view[name] for name in _READ}
@@ -97,7 +97,7 @@ class WarpBatch:
         self._update()
 
     def _update(self) -> None:
-        """Compute what is read of a state: positions, velocities and bias forces."""
+        """Compute the quantities that are read: positions, velocities and bias forces."""
         for compute in (mjw.kinematics, mjw.com_pos, mjw.com_vel, mjw.rne):
             compute(self._model, self._data)
 
@@ -114,11 +114,11 @@ class WarpBatch:
 
     @property
     def bytes_each(self) -> int:
-        """Memory of the host that each simulation takes: none if they are on a GPU."""
+        """Host memory of each simulation, bytes: none, as the state is on the GPU."""
         return 0
 
     def data(self, sim: int) -> mujoco.MjData:
-        """Return the MjData of one simulation, computed by C MuJoCo from its positions."""
+        """Return the MjData that C MuJoCo computes from one simulation's qpos and qvel."""
         data = mujoco.MjData(self.scene.model)
         data.qpos[:] = self._state["qpos"][sim].cpu().numpy()
         data.qvel[:] = self._state["qvel"][sim].cpu().numpy()
@@ -144,8 +144,8 @@ class WarpBatch:
         """Take one control step with targets of the hand's driven joints ctrl (N, nu), m and rad.
 
         Returns:
-            Whether each simulation diverged, (N,) bool: a position that is not finite, or more
-            contacts or constraints than there is room for.
+            Whether each simulation diverged, (N,) bool: a position is not finite, or contacts or
+            constraint rows exceed their limits.
         """
         n = self.scene.index.num_compensated
         targets = torch.as_tensor(ctrl, device=self.device).float()
@@ -157,7 +157,7 @@ class WarpBatch:
         return full | ~torch.isfinite(self._state["qpos"]).all(1)
 
     def read(self, ids: Array | None = None) -> SimState:
-        """Return the current state of simulations ids, or of all; float64 for the MDP's sums."""
+        """Return the current state of simulations ids, or of all, converted to float64."""
         rows = slice(None) if ids is None else torch.as_tensor(ids, device=self.device)
         value = {name: values[rows].double() for name, values in self._read.items()}
         bodies, points = self._bodies, value["geom_xpos"][:, self._geoms]
@@ -171,10 +171,10 @@ class WarpBatch:
         )
 
     def restore(self, rows: Array) -> None:
-        """Restore a copy of ``rows``.
+        """Restore all simulations from an earlier copy of ``rows``.
 
         Raises:
-            SceneError: if the rows have another shape and so belong to another scene or engine.
+            SceneError: if the rows have the wrong shape, that of another scene or engine.
         """
         rows, shape = torch.as_tensor(rows, device=self.device), self.rows.shape
         if rows.shape != shape:
@@ -199,7 +199,7 @@ class WarpBatch:
     def set_variation(
         self, ids: np.ndarray, friction: np.ndarray, half_width: np.ndarray, mass: np.ndarray
     ) -> None:
-        """Set the object's friction (k, 3), half-width (k,) m and mass (k,) kg in simulations."""
+        """Set the object's friction (k, 3), half-width (k,) m and mass (k,) kg in ids (k,)."""
         rows = torch.as_tensor(ids, device=self.device)
         size = self._geom("geom_size")
         self._geom("geom_friction")[rows] = torch.as_tensor(friction).float().to(self.device)
@@ -232,10 +232,10 @@ _READ = ("qpos", "qvel", "qfrc_bias", "geom_xpos", "xquat", "xipos", "cvel", "su
 
 
 def _warp_device(device: str) -> Any:
-    """Return Warp's device of a torch device.
+    """Return Warp's device for a torch device.
 
     Raises:
-        ConfigError: if Warp has none, such as without a driver.
+        ConfigError: if Warp cannot use it, for example without a driver.
     """
     try:
         return wp.get_device("cuda:0" if device == "cuda" else device)
