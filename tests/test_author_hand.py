@@ -27,6 +27,8 @@ from pgdm.library import open_library
 from pgdm.library.authored import hand_file, own
 from pgdm.library.checks.verify import damaged
 from pgdm.pregrasp.hand_geometry import opposing_finger, posed
+from pgdm.pregrasp.labeler.kinematics import Kinematics
+from pgdm.pregrasp.labeler.measures import Meter
 from pgdm.pregrasp.sources import is_reset_pose
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.contact import HandContact
@@ -108,6 +110,16 @@ def test_a_mimic_joint_follows_and_has_no_servo() -> None:
     q = sim.read().qpos[0].numpy()
     assert q[7] == pytest.approx(1.0, abs=0.03)
     assert q[8] == pytest.approx(0.1 + 0.8 * q[7], abs=0.02)
+
+
+def test_the_labeler_names_a_coupled_joint_outside_its_limits() -> None:
+    scene = author_hand(request(saved(urdf(mimic=True)))).scene
+    meter = Meter(scene, Kinematics(scene))
+    qpos = np.concatenate((scene.index.reset, [2.0, 0, 0, 0, 0, 0]))
+    assert meter.measure(qpos).beyond == ()
+    qpos[17] = 1.7  # the last finger's follower reaches 1.6; the hand has only 14 actuators
+    (named,) = meter.measure(qpos).beyond
+    assert named.startswith("thumb")
 
 
 def test_a_leaders_range_is_narrowed_to_what_its_follower_allows() -> None:

@@ -107,6 +107,7 @@ def test_limits_of_a_worked_motion() -> None:
     assert used.share["velocity"][1:].max() < 1e-9
     assert used.share["position"][0] == pytest.approx(2.8973 - 1.0, abs=1e-6)
     assert used.violations == [] and used.slower == 1.0
+    assert usage(time_s, np.tile(READY, (201, 1))).slower == 1.0  # an arm at rest
 
 
 def test_violations_name_joint_quantity_and_time() -> None:

@@ -123,11 +123,10 @@ def _firmest(scene: Scene, poses: list[NearPose], progress: StepProgress) -> Fou
     best = int(np.nanargmax(rates)) if lift.possible else 0
     pose = poses[best]
     tips = ", ".join(f"{1e3 * d:.0f}" for d in pose.tip_distances_m)
-    notes = [
-        f"pre-grasp: fingertips {tips} mm from the object, nothing touched; "
-        f"{rates[best]:.0%} of random closings of the hand lift it"
-    ]
-    return FoundPregrasp(pose.qpos, "search", notes)
+    note = f"pre-grasp: fingertips {tips} mm from the object, nothing touched"
+    if lift.possible:
+        note += f"; {rates[best]:.0%} of random closings of the hand lift it"
+    return FoundPregrasp(pose.qpos, "search", [note])
 
 
 def _base_over(scene: Scene, poses: Poses) -> Callable[[np.ndarray], np.ndarray]:

@@ -69,8 +69,8 @@ class Usage:
 
         With the largest shares v, a, j of these limits: min(1, 1/v, a^(-1/2), j^(-1/3)).
         """
-        roots = {"velocity": 1.0, "acceleration": 2.0, "jerk": 3.0}
-        return min(1.0, *(float(self.share[k].max()) ** (-1 / n) for k, n in roots.items()))
+        roots = {"velocity": 1, "acceleration": 2, "jerk": 3}
+        return min(max(1.0, float(self.share[k].max())) ** (-1 / n) for k, n in roots.items())
 
 
 def smooth(time_s: np.ndarray, values: np.ndarray) -> BSpline:
