@@ -1,4 +1,4 @@
-"""``pgdm``: everything besides training."""
+"""``pgdm``: all commands except starting a training run."""
 
 from __future__ import annotations
 
@@ -113,7 +113,12 @@ def _options(
 def evaluate(
     policy: Policy,
     episodes: Annotated[
-        int | None, typer.Option(min=1, help="Number of episodes; by default as in the run.")
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of sampled episodes, and of deterministic ones if the task is randomised; "
+            "by default as in the run.",
+        ),
     ] = None,
     video: Annotated[
         bool, typer.Option("--video", help="Also make a video of the policy.")
@@ -124,7 +129,9 @@ def evaluate(
     best: Best = False,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Seed of the action noise; by default the run's."),
+        typer.Option(
+            min=0, help="Seed of action noise and task randomisation; by default the run's."
+        ),
     ] = None,
     task: ZipTask = None,
     settings: ZipSettings = None,
@@ -177,7 +184,8 @@ def export_policy(
         bool, typer.Option("--deterministic", help="Only minari: use the mean action, no noise.")
     ] = False,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Only minari: seed of the noise [the run's].")
+        int | None,
+        typer.Option(min=0, help="Only minari: seed of noise and task randomisation [the run's]."),
     ] = None,
     best: Best = False,
     task: ZipTask = None,
@@ -254,7 +262,9 @@ def view(
     hand: Hand = None,
     expert: Annotated[
         bool,
-        typer.Option("--expert", help="Play the recorded human hand; spheres mark contacts."),
+        typer.Option(
+            "--expert", help="Play the expert's hand motion, on Adroit; spheres mark contacts."
+        ),
     ] = False,
     reach: Annotated[
         bool,
@@ -283,7 +293,9 @@ def view(
     if reach + wrist + ablations + expert > 1:
         raise ConfigError("--reach, --wrist, --ablations and --expert exclude each other")
     if expert and (pregrasp is not None or hand is not None):
-        raise ConfigError("--expert shows a recorded hand: leave --pregrasp and --hand out")
+        raise ConfigError(
+            "--expert shows the expert's hand motion: leave --pregrasp and --hand out"
+        )
     with loading():
         from pgdm.cli.ablations import view_ablations
         from pgdm.cli.view import View, view_expert, view_reach, view_task, view_wrist

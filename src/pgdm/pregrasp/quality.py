@@ -22,8 +22,8 @@ LIFT_M = 0.02
 RAISE_M = 0.1
 """How far a policy raises the hand, unless a slide reaches its limit before."""
 PRESS_M = 0.03
-"""Largest distance by which a policy pushes the palm forwards while the hand closes."""
-_SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # std of the hand's shift, and of joints that close nothing
+"""Largest distance that the hand moves in the palm's direction while it closes."""
+_SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # std: hand's shift; joints that only spread the fingers
 _PRESS_STEPS, _CLOSE_STEPS, _LIFT_STEPS, _HOLD_STEPS = 8, 20, 25, 15  # control steps
 _FASTEST, _SLOWEST = 4, 16  # control steps in which a finger closes
 _GRIP, _FINGER, _JOINT = (0.3, 1.0), (0.5, 1.0), (0.7, 1.3)  # factors of full flexion
@@ -34,7 +34,7 @@ class Quality:
     """Measurements of a pre-grasp."""
 
     free: bool
-    """Whether the hand touches nothing but itself (less than 0.1 mm of penetration)."""
+    """Whether the hand touches nothing but itself (at most 0.1 mm of penetration)."""
     depth_m: float
     """Deepest penetration between the hand and anything else."""
     fingertip_distance_m: float
@@ -51,10 +51,12 @@ class Quality:
 class LiftTest:
     """The lift test: random closing policies try to lift the object from a pre-grasp.
 
-    A policy pushes the palm forwards a little and closes each finger at its own random speed by a
-    random share of full flexion, then raises the hand by :data:`RAISE_M` and holds it still. It
-    succeeds if the object stays at least :data:`LIFT_M` above its start during the hold. Equal
-    arguments give an equal result, whatever the number of threads.
+    A policy moves the hand a little in the direction that the palm faces, plus a random shift. It
+    flexes each finger, at the finger's own random speed, by a random share of the way from its
+    pre-grasp to full flexion, and moves the other finger joints at random. Then it raises the hand
+    by :data:`RAISE_M` and holds it still. It succeeds if the object stays at least :data:`LIFT_M`
+    above its start during the hold. Equal arguments give an equal result, whatever the number of
+    threads.
 
     Args:
         scene: scene of the task.

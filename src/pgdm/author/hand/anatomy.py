@@ -12,7 +12,7 @@ from pgdm.errors import ConfigError, check_name
 from pgdm.library.couplings import Couplings
 
 HUMAN = ("index", "middle", "ring", "little", "thumb")
-"""Human fingers, in the order of a hand's settings."""
+"""Human fingers, in the order in which ``pgdm author hand`` lists them."""
 PREFIXES = {"index": "ff", "middle": "mf", "ring": "rf", "little": "lf", "thumb": "th"}
 """Prefixes of the tracked points' names, as in the benchmark's hands."""
 
@@ -86,7 +86,7 @@ def find(model: mujoco.MjModel, chosen: Mapping[str, str], label: str) -> Anatom
         label: the hand's file, for messages.
 
     Raises:
-        ConfigError: the hand has fewer than three or more than five fingers or is on an arm, two
+        ConfigError: the hand does not have three to five fingers, the hand is on an arm, two
             fingers share a joint, or ``chosen`` does not fit.
     """
     moved = model.body_jntnum > 0
@@ -306,7 +306,7 @@ def _ancestors(parents: np.ndarray, body: int) -> list[int]:
 
 
 def _joints(model: mujoco.MjModel, bodies: list[int]) -> list[int]:
-    """Return the joints of bodies, outermost last; the bodies are in the opposite order."""
+    """Return the joints of bodies, outermost last, given the bodies, outermost first."""
     starts = [(int(model.body_jntadr[b]), int(model.body_jntnum[b])) for b in reversed(bodies)]
     return [j for start, count in starts for j in range(start, start + count)]
 

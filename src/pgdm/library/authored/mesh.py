@@ -18,13 +18,13 @@ UNITS_M = {"mm": 0.001, "cm": 0.01, "m": 1.0}
 """Length of each mesh unit, m."""
 
 SIZES_M = (0.02, 0.6)
-"""Smallest and largest accepted longest side of an object, m, for a hand to manipulate it."""
+"""Range in which an object's longest side must lie, m, so that a hand can manipulate it."""
 
 MAX_FACES = 20_000
-"""Meshes with more faces are simplified: a difference is not visible, and MuJoCo refuses more than
-200,000."""
+"""Meshes with more faces are simplified, without visible difference. (MuJoCo's own limit is
+200,000.)"""
 
-_THIN_M = 5e-4  # the models' contact margin; an object must be thicker
+_THIN_M = 5e-4  # the models' contact margin; an object must be at least as thick
 _OPEN_SHARE = 0.5  # an open surface with a smaller share of its hull's volume is refused
 _MAX_BODIES = 50
 _LID_SHARE = 0.15  # holes are filled if the lids have at most this share of the surface's area
@@ -64,7 +64,7 @@ def read(path: Path, scale: float = 1.0, allow_open: bool = False) -> SoundMesh:
     Args:
         path: STL, OBJ, PLY, GLB or OFF.
         scale: metres per unit of the file.
-        allow_open: accept a surface that is far from closed, as the object's mass is known.
+        allow_open: accept a surface that is far from closed; for objects whose mass is given.
 
     Raises:
         ConfigError: the format is not supported, there is no such file, or the size is implausible
@@ -195,7 +195,7 @@ def _fill(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: boo
                 f"{label}: its surface is open; a lid would have {share:.0%} of its area, so its "
                 "volume is unknown; close it in your mesh editor, or give --mass KG"
             )
-        repairs.append(f"left its opening open: a lid would have {share:.0%} of its area")
+        repairs.append(f"left the surface open: a lid would have {share:.0%} of the surface's area")
         return
     edges = _rims(mesh)
     hole = _holes(edges, len(mesh.vertices))

@@ -10,9 +10,9 @@ from pgdm.library import manifest as manifests
 from pgdm.library.manifest import FileEntry
 
 FORMAT = 1
-"""Version of the folder's layout and of the code that fills the folder."""
+"""Version of the library's folder ``experts``: of its layout and of the code that fills it."""
 
-_CURE = "fill them again with 'pgdm assets fetch'"
+_CURE = "fetch the expert trajectories again with 'pgdm assets fetch --experts'"
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,10 @@ class ExpertEntry:
     touching_frames: int
     """Number of poses at which the hand touches the object according to the recording."""
     contact_frames: list[int]
-    """Number of these poses with the finger in contact (index, middle, little, ring, thumb)."""
+    """Of the ``touching_frames`` poses, the number with each finger in contact (index, middle, little,
+    ring, thumb)."""
     within_5mm: list[float]
-    """Share of these poses with the finger within 5 mm of the object, by finger."""
+    """Of the ``touching_frames`` poses, the share with each finger within 5 mm of the object."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class ExpertIndex:
     experts: dict[str, ExpertEntry]
     """Expert trajectories by task id."""
     left_out: dict[str, str]
-    """Motion-capture tasks without a usable trajectory in the package, with the reason."""
+    """Motion-capture tasks for which no trajectory is stored, with the reason."""
     format: int = FORMAT
     """Layout version."""
 

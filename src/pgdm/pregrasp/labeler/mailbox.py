@@ -17,8 +17,8 @@ Action = Callable[[], None]
 class Mailbox:
     """Runs actions posted by any thread, in order, on a thread of its own.
 
-    If consecutive waiting actions have the same key, only the last one runs. So the updates of a
-    drag do not pile up when they come faster than they can be computed.
+    Of consecutive waiting actions with the same key, other than None, only the last one runs: the
+    updates of a drag do not pile up when they come faster than they can be computed.
 
     Args:
         complain: receives the error message if an action fails.
@@ -33,7 +33,7 @@ class Mailbox:
         self._thread.start()
 
     def post(self, action: Action, key: Hashable = None) -> None:
-        """Queue an action; it replaces the last waiting action if both have the same key."""
+        """Queue an action; with a key, it replaces the last waiting action of the same key."""
         with self._condition:
             if key is not None and self._waiting and self._waiting[-1][0] == key:
                 self._waiting.pop()

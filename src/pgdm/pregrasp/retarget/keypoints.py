@@ -30,7 +30,7 @@ _JOINTS = ("knuckle", "middle", "distal", "tip")
 _BONE_M = 0.005, 0.16
 """Shortest and longest plausible bone: an infant's fingertip, the largest palm."""
 _SPAN_M = 0.05
-"""Shortest plausible distance from the wrist to a finger's pad along the bones: an infant's."""
+"""Smallest plausible :attr:`Keypoints.span_m`: an infant's hand."""
 _FLAT_M = 0.003
 """Measurement tolerance: how far the thumb of a right hand may lie behind the plane of the palm."""
 _WORLD_M = 1e6
@@ -62,8 +62,9 @@ class Keypoints:
             label: name of the points in error messages.
 
         Raises:
-            ConfigError: the number of points is wrong, a coordinate is NaN, bone lengths are
-                impossible (perhaps in another unit than metres), or the hand is a left one.
+            ConfigError: the number of points is wrong, a coordinate is not finite or 1e6 or
+                more, bone lengths are impossible (perhaps in another unit than metres), or the
+                hand is a left one.
         """
         points = np.asarray(points, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or len(points) not in (16, 21):
@@ -74,7 +75,10 @@ class Keypoints:
         wrong = np.argwhere(~(np.abs(points) < _WORLD_M))  # NaN compares as false
         if len(wrong):
             row, axis = wrong[0]
-            raise ConfigError(f"{label}: point {row} has {'xyz'[axis]} = {points[row, axis]}")
+            raise ConfigError(
+                f"{label}: point {row} has {'xyz'[axis]} = {points[row, axis]}; coordinates must "
+                f"be finite and below {_WORLD_M:g}"
+            )
         order = order or ("mano" if len(points) == 16 else "openpose")
         check_name(f"{label}: order of points", order, ORDERS)
         hand = cls(points[0], _sorted(points, order, label))
@@ -138,7 +142,7 @@ class Keypoints:
             finger, bone = wrong[0]
             begin = "wrist" if bone == 0 else _JOINTS[bone - 1]
             raise ConfigError(
-                f"{label}: {FINGERS[finger]} finger, {begin} to {_JOINTS[bone]}: "
+                f"{label}: {FINGERS[finger]}, {begin} to {_JOINTS[bone]}: "
                 f"{bones[finger, bone]:.3g} m, but bones are {_BONE_M[0]} to {_BONE_M[1]} m long"
             )
         if self.span_m < _SPAN_M:
