@@ -43,8 +43,8 @@ class ExpertEntry:
     touching_frames: int
     """Number of poses at which the hand touches the object according to the recording."""
     contact_frames: list[int]
-    """Of the ``touching_frames`` poses, the number with each finger in contact (index, middle, little,
-    ring, thumb)."""
+    """Of the ``touching_frames`` poses, the number with each finger in contact (index, middle,
+    little, ring, thumb)."""
     within_5mm: list[float]
     """Of the ``touching_frames`` poses, the share with each finger within 5 mm of the object."""
 
