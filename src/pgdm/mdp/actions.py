@@ -95,7 +95,7 @@ def _range(index: SceneIndex) -> tuple[Tensor, Tensor]:
 
 
 def normalize(index: SceneIndex, qpos: Tensor) -> Tensor:
-    """Return the absolute action (nu,) whose targets are the driven joints of qpos, clipped."""
+    """Return the absolute action (nu,) with the driven joints' positions as targets, clipped."""
     middle, half = _range(index)
     return ((qpos[index.driven] - middle) / half).clamp(-1.0, 1.0)
 
