@@ -82,7 +82,7 @@ BROKEN = {
     "out of range": (
         "<equality>",
         '<equality><joint joint1="h/f1" joint2="h/f0" polycoef="0 1.5 0 0 0"/>',
-        "joint 'h/f1' leaves its range by 0.500 when 'h/f0' goes to the end",
+        "joint 'h/f1' leaves its range by 0.500 when 'h/f0' moves over its range",
     ),
     "not active": (
         "<equality>",

@@ -29,7 +29,7 @@ class CemCfg:
     """Lower bound of the standard deviation, as a share of the first one: keeps the Gaussian from
     collapsing early."""
     added: float = 0.0
-    """Share of the first standard deviation added in each round, for the same reason."""
+    """Share of the first standard deviation added in each round, also against early collapse."""
 
 
 class CrossEntropy:
@@ -37,7 +37,7 @@ class CrossEntropy:
 
     Args:
         mean: mean of the first samples (D,).
-        std: their standard deviation (D,).
+        std: standard deviation of the first samples (D,).
         cfg: settings of the search.
         random: random stream of the samples.
     """

@@ -120,7 +120,7 @@ class UnsafePickleError(CorruptAssetError):
 
 
 class SceneError(PgdmError):
-    """A scene does not compile, or lacks a named body, joint or geom."""
+    """A scene does not compile, lacks a named part, or violates pgdm's requirements."""
 
 
 class RenderError(PgdmError):
@@ -128,7 +128,7 @@ class RenderError(PgdmError):
 
 
 class CheckpointError(PgdmError):
-    """A checkpoint is missing, damaged, or belongs to another configuration."""
+    """A checkpoint is missing, damaged, of another configuration, or cannot be written."""
 
 
 class RunError(PgdmError):

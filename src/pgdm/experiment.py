@@ -104,8 +104,8 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
     If assets must be fetched or a start state computed first, return only a note about that.
 
     Raises:
-        ConfigError: if its start state is missing and would not be computed, or there is no such
-            hand.
+        ConfigError: if its start state is missing and would not be computed, there is no such hand,
+            or too little memory is free.
         SceneError: if the scene does not compile, or the hand violates pgdm's assumptions.
     """
     task = cfg.task.motion
@@ -126,7 +126,7 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
 
 
 def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
-    """Return sentences on a run's deviations from its settings, long duration and disk space."""
+    """Return sentences on deviations from the settings, shaping, duration, disk and schedules."""
     late, days = builder.mdp.recipe.unfinished(cfg.total_frames), cfg.usual_days
     return [
         *builder.notes,

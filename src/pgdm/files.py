@@ -69,7 +69,7 @@ def open_file(path: str | os.PathLike[str]) -> io.BufferedReader:
     """Open a regular file, or a link to one, for reading.
 
     Raises:
-        OSError: if it does not exist, or is a folder, a pipe, a socket or a device.
+        OSError: if it cannot be opened, or is a folder, a pipe, a socket or a device.
     """
     # Without O_NONBLOCK, opening a pipe waits for a writer.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -165,8 +165,8 @@ def parse_yaml(text: str) -> Any:
     """Return the plain values of a YAML text; None if it is empty.
 
     Raises:
-        ValueError: if it is not YAML, or exceeds ``MOST_DEPTH`` or ``MOST_NODES``; the message is
-            one line.
+        ValueError: if it is not YAML, exceeds ``MOST_DEPTH`` or ``MOST_NODES``, or has an integer
+            of more than 20 digits; the message is one line.
     """
     try:
         return _Loader(text).get_single_data()

@@ -38,7 +38,7 @@ def make_batch(
     Args:
         task: task id, such as ``hammer-use1``.
         num_envs: N.
-        num_threads: threads that step them; 0 takes one per core.
+        num_threads: threads that step the simulations; 0 takes one per core available here.
         seed: seed of the randomisation at each reset, in tasks that have it.
         auto_reset: whether rows restart automatically when their episode ends.
         offline: whether missing assets are an error instead of being fetched.
@@ -53,7 +53,7 @@ def make_batch(
 
     Raises:
         ConfigError: if a name or value is wrong, or the simulations do not fit into the memory.
-        LibraryError: if the task's assets are missing.
+        LibraryError: if the task's assets are missing and cannot be fetched.
     """
     for name in choices:
         if name not in _GROUPS:
@@ -74,7 +74,10 @@ def make_batch(
 
 
 def make_torchrl(task: str, *, num_envs: int = 64, **kwargs: Any) -> PgdmTorchRLEnv:
-    """Return N simulations of a task as a TorchRL EnvBase; arguments as `make_batch`."""
+    """Return N simulations of a task as a TorchRL EnvBase.
+
+    Arguments as `make_batch`, without ``auto_reset``: TorchRL requests resets itself.
+    """
     check_interpreter()
     from pgdm.envs.torchrl import PgdmTorchRLEnv
 
@@ -82,7 +85,9 @@ def make_torchrl(task: str, *, num_envs: int = 64, **kwargs: Any) -> PgdmTorchRL
 
 
 def make_sb3(task: str, *, num_envs: int = 64, **kwargs: Any) -> PgdmVecEnv:
-    """Return N simulations of a task as a Stable-Baselines3 VecEnv; arguments as `make_batch`.
+    """Return N simulations of a task as a Stable-Baselines3 VecEnv.
+
+    Arguments as `make_batch`; ``auto_reset`` must stay True.
 
     Raises:
         ConfigError: also if Stable-Baselines3 is not installed.
@@ -97,9 +102,10 @@ def make_sb3(task: str, *, num_envs: int = 64, **kwargs: Any) -> PgdmVecEnv:
 
 
 def make_gym(task: str, *, render_mode: str | None = None, **kwargs: Any) -> PgdmEnv:
-    """Return one simulation of a task as a Gymnasium env; arguments as `make_batch`.
+    """Return one simulation of a task as a Gymnasium env.
 
-    This is what ``gymnasium.make("pgdm/<task>-v0", ...)`` calls.
+    Arguments as `make_batch`, without ``num_envs``, ``num_threads`` and ``auto_reset``. This is
+    what ``gymnasium.make("pgdm/<task>-v0", ...)`` calls.
     """
     from pgdm.envs.gym import PgdmEnv
 

@@ -214,7 +214,7 @@ class BatchEnv:
             self._randomize.reseed(seed)
 
     def warm_start(self) -> Tensor:
-        """Return the action (A,) at which a policy's mean starts (released code)."""
+        """Return the action (A,) at which a policy's mean starts; see `ActionMap`."""
         return self.mdp.actions.warm_start.float()
 
     def state_dict(self) -> dict[str, Any]:

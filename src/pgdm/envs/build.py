@@ -191,7 +191,7 @@ class EnvBuilder:
         return facts
 
     def differences(self, recorded: Mapping[str, Any]) -> Iterator[str]:
-        """Yield a text for each of a run's recorded facts that differs from this environment's."""
+        """Yield a text for each fact of this environment that a run recorded otherwise or lacks."""
         for key, now in self.facts().items():
             if recorded.get(key) != now:
                 text = f"{key} '{recorded.get(key)}', and the library now has '{now}'"
@@ -216,15 +216,16 @@ class EnvBuilder:
         dump_dir: Path | None = None,
         device: str = "cpu",
     ) -> BatchEnv:
-        """Return N simulations of the task; see `BatchEnv` for the arguments.
+        """Return N simulations of the task.
 
-        ``stream`` names the random stream and thereby the use of the simulations. Only ``train``
-        has the shaping and the configured engine, on ``device``; the simulations of all other
-        streams run in C MuJoCo.
+        ``num_threads`` is as in `SimBatch`, ``auto_reset`` and ``dump_dir`` as in `BatchEnv`;
+        ``seed`` is the seed of the randomisation at resets, if the task has it. ``stream`` names
+        the random stream and thereby the use of the simulations. Only ``train`` has the shaping and
+        the configured engine, on ``device``; the simulations of all other streams run in C MuJoCo.
 
         Raises:
-            ConfigError: if ``num_envs`` is below 1, the simulations do not fit into the memory, or
-                the engine is not installed or cannot use the device.
+            ConfigError: if ``num_envs`` is below 1 or ``num_threads`` below 0, the simulations do
+                not fit into the memory, or the engine is not installed or cannot use the device.
         """
         check_count("num_envs", num_envs, 1)
         check_count("num_threads", num_threads, 0)
@@ -261,8 +262,10 @@ class EnvBuilder:
     def check_memory(self, key: str, num_envs: int, others_bytes: float = 0.0) -> None:
         """Check that ``num_envs`` simulations and ``others_bytes`` fit into the free memory.
 
+        Training simulations in MuJoCo Warp count as 0: they are in the device's memory.
+
         Raises:
-            ConfigError: if they do not; the message names ``key``, the setting to reduce.
+            ConfigError: if they do not fit; the message names ``key``, the setting to reduce.
         """
         on_device = key == "num_envs" and self._cfg.sim.engine == WARP
         each = 0 if on_device else self.probe.sim.bytes_each

@@ -47,6 +47,8 @@ class History:
     def dump(self, sims: list[int], steps: list[int]) -> None:
         """Write the last states and targets of simulations to one file each, oldest first.
 
+        The folder gets at most ``MAX_DUMPS`` files; without a folder there is only a warning.
+
         Args:
             sims: indices of the simulations.
             steps: their control steps since reset; states of earlier episodes are left out.

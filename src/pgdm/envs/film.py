@@ -17,7 +17,7 @@ from pgdm.sim.render import Renderer, write_image, write_video
 from pgdm.sim.scene import Scene
 
 _CLOSE_M = 0.4  # height of the picture around the object when contacts are shown
-LAST_FRAME_REPEATS = 12  # half a second of the final state
+LAST_FRAME_REPEATS = 12  # of the final state: about half a second at 25 frames per second
 
 Act = Callable[[Tensor], Tensor]
 
@@ -75,7 +75,8 @@ def film_clip(clip: Clip, fps: int, path: Path, progress: StepProgress = silent)
         clip: what to show.
         fps: frames per second.
         path: path of the MP4.
-        progress: called with the number of frames drawn.
+        progress: called before OpenGL is opened, with the number of frames drawn so far, and before
+            the video is encoded.
 
     Raises:
         RenderError: if no OpenGL works here or the file cannot be written.

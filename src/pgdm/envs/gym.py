@@ -72,7 +72,8 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
                 deployment; the episode starts where the reach ends.
 
         Raises:
-            ConfigError: if an option is unknown, or no plan leads to the start state.
+            ConfigError: if an option is unknown or invalid, or no plan leads to the start state.
+            RunError: if the reach diverges.
         """
         super().reset(seed=seed)
         asked = options or {}
@@ -103,7 +104,7 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def render(self) -> np.ndarray | None:
         """Return the current picture, (H, W, 3) uint8, the target drawn as a translucent object.
 
-        None unless the mode is ``rgb_array``; a window is updated by every step.
+        None unless the mode is ``rgb_array``; a window is updated by every reset and step.
         """
         if self.render_mode != "rgb_array":
             return None

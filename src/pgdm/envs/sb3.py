@@ -37,7 +37,10 @@ class PgdmVecEnv(VecEnv):
         )
 
     def reset(self) -> np.ndarray:
-        """Restart all simulations; return observations (N, D)."""
+        """Restart all simulations; return observations (N, D).
+
+        A seed passed to ``seed`` before reseeds the randomisation, in tasks that have it.
+        """
         if (seed := self._seeds[0]) is not None:
             self.batch.reseed(seed)
         self._reset_seeds()

@@ -41,7 +41,7 @@ class PgdmTorchRLEnv(EnvBase):
         )
 
     def warm_start(self) -> torch.Tensor:
-        """Return the action (A,) at which a policy's mean starts (released code)."""
+        """Return the action (A,) at which a policy's mean starts; see `pgdm.mdp.actions`."""
         return self._batch.warm_start()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:

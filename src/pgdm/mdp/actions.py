@@ -28,7 +28,8 @@ class ActionCfg:
     """``absolute``: joint position targets (the paper); ``residual``: the base follows the
     exemplar motion and the policy adds a correction."""
     lead_steps: int
-    """Residual: control steps by which the base's command leads the motion, to offset servo lag."""
+    """Residual without a wrist plan: control steps by which the base's command leads the motion, to
+    offset servo lag."""
     residual_scale: float
     """Residual: largest correction as a fraction of the half-range of each base joint (0..1)."""
     wrist_path: str
@@ -95,7 +96,7 @@ def _range(index: SceneIndex) -> tuple[Tensor, Tensor]:
 
 
 def normalize(index: SceneIndex, qpos: Tensor) -> Tensor:
-    """Return the absolute action (nu,) whose targets are the driven joints of qpos, clipped."""
+    """Return the absolute action (nu,) with the driven joints' positions as targets, clipped."""
     middle, half = _range(index)
     return ((qpos[index.driven] - middle) / half).clamp(-1.0, 1.0)
 
@@ -128,7 +129,7 @@ def _residual(
     base = _absolute(index, start)
     n = index.num_base_joints
     if commands is None and cfg.wrist_path == PLANNED:
-        raise ConfigError("action.wrist_path=planned needs the commands of a plan")
+        raise ConfigError("action.wrist_path=planned needs the base commands of a wrist plan")
     if commands is None:
         path, lead = PATHS[cfg.wrist_path](index, reference, start), cfg.lead_steps
     else:  # planned commands already compensate for the servo lag

@@ -76,7 +76,7 @@ class StepContext:
 
     @cached_property
     def contact_distance(self) -> Tensor:
-        """Distance of each fingertip from the expert's contact point, (n, F) m; contact or not."""
+        """Distance of each fingertip from the expert's contact or closest point, (n, F) m."""
         return torch.linalg.vector_norm(self.contact_points - self.fingertips, dim=-1)
 
     def hand_error(self, space: str, form: str) -> Tensor:

@@ -65,10 +65,12 @@ class Recipe:
     """Whether terms or measures compare the hand with an expert's."""
 
     def __post_init__(self) -> None:
-        """Check that terms have the right class, valid and distinct names, and finite weights.
+        """Check that there are rewards and terminations, and that all terms are valid.
+
+        Terms must have the right class, valid and distinct names, and finite weights.
 
         Raises:
-            ConfigError: at the first invalid term.
+            ConfigError: if rewards or terminations are missing, or at the first invalid term.
         """
         if not self.rewards or not self.ends:
             raise ConfigError("a recipe needs at least one reward and one termination")
@@ -133,7 +135,7 @@ class Recipe:
         return [(name, last[name], w) for name, w in final.items() if last[name] != w]
 
     def table(self) -> list[tuple[str, str, str]]:
-        """Return the active terms as rows of text: kind, name, weight."""
+        """Return all terms as rows of text: kind, name, weight; empty where a term has none."""
         first = self._scheduled(0)
         rows = [
             (

@@ -44,7 +44,7 @@ def tracking(c: StepContext, scale: float, orientation_scale: float) -> Tensor:
 
 
 def lift(c: StepContext, height_m: float) -> Tensor:
-    """Return 1 if object and target are ``height_m`` above the object's start, else 0, (n,)."""
+    """Return 1 if object and target are >= ``height_m`` above the object's start, else 0, (n,)."""
     lower = torch.minimum(c.target_pos[:, 2], c.state.object_pos[:, 2])
     return (lower >= c.start_height + height_m).double()
 

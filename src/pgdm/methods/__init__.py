@@ -21,7 +21,7 @@ def config_class(name: str) -> type[MethodCfg]:
     """Return the class of a method's settings.
 
     Raises:
-        ConfigError: if there is no such method.
+        ConfigError: if there is no such method, or a user's own cannot be imported.
     """
     return find(name, METHODS).config
 
@@ -30,7 +30,8 @@ def recipe(cfg: MethodCfg) -> Recipe:
     """Return the configured method's Recipe.
 
     Raises:
-        ConfigError: if there is no such method, or it exits Python or returns anything else.
+        ConfigError: if there is no such method, or its recipe function ends Python or returns
+            anything but a Recipe.
     """
     try:
         made = find(cfg.name, METHODS).recipe(cfg)

@@ -1,4 +1,4 @@
-"""Task curriculum: first only the lift is rewarded, then also tracking (paper, App. D)."""
+"""Task curriculum: a constant lift bonus, and tracking with a growing weight (paper, App. D)."""
 
 from __future__ import annotations
 

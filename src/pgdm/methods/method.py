@@ -31,7 +31,8 @@ def find(name: str, methods: Mapping[str, Method]) -> Method:
 
     Raises:
         UnknownNameError: if there is no method of that name.
-        ConfigError: if the module does not exist, is not valid Python or has no such `Method`.
+        ConfigError: if the location is malformed, the module cannot be imported, or it has no such
+            `Method`.
     """
     if ":" in name:
         return _imported(name)

@@ -27,7 +27,7 @@ class MethodCfg:
     """Largest distance from the target at which a step counts as a success, m."""
 
     def validate(self) -> None:
-        """Check the numbers, then ``validate`` each section that has this method.
+        """Check the numbers, then call ``validate`` of each section that defines it.
 
         Raises:
             ConfigError: at the first invalid one.

@@ -18,7 +18,8 @@ class GaussianActor(TensorDictModuleBase):
     """A policy N(net(observation), exp(log_std)^2) with state-independent standard deviations.
 
     Reads ``observation`` (..., D); writes ``loc`` and ``action``, (..., A), and
-    ``action_log_prob`` (...). It samples unless TorchRL's exploration type is deterministic.
+    ``action_log_prob`` (...). It samples if TorchRL's exploration type is random or None; otherwise
+    the action is the mean.
 
     Args:
         net: maps observations (..., D) to means (..., A).

@@ -47,8 +47,8 @@ def build_learner(
         replay_folder: where an off-policy learner stores its replay, or None to keep it in memory.
 
     Raises:
-        ConfigError: if the settings do not fit the number of simulations.
-        RunError: if the disk has no room for the replay.
+        ConfigError: if the settings are invalid or do not fit the number of simulations.
+        RunError: if the files of the replay cannot be created, for example on a full disk.
     """
     cfg.check(env.num_envs)
     threads = num_threads or torch.get_num_threads()

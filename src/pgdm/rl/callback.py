@@ -21,7 +21,7 @@ class Progress:
     iteration: int
     """Iterations (collect and learn) so far."""
     elapsed_s: float
-    """Time spent on the training, s, summed over all attempts."""
+    """Time spent on the run, s, evaluations included, summed over all attempts."""
 
 
 class Callback:

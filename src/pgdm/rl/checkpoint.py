@@ -151,8 +151,8 @@ def read_checkpoint(path: Path) -> State:
     """Return the state in a checkpoint file.
 
     Raises:
-        CheckpointError: if the file is missing, damaged, or holds more than tensors and plain
-            values (nothing in it is ever executed).
+        CheckpointError: if the file cannot be read, is damaged, or holds anything other than a
+            dictionary of tensors and plain values (nothing in it is ever executed).
     """
     try:
         raw = files.read_bytes(path)

@@ -49,8 +49,8 @@ class RolloutCollector(BaseCollector):
         policy: reads ``observation`` (N, D), writes ``action`` (N, A). It is not copied, so a
             training loop that changes its weights in place needs no `update_policy_weights_`.
         frames_per_batch: N * T, environment steps in a rollout.
-        total_frames: environment steps after which iteration stops, with a complete rollout;
-            -1: unlimited.
+        total_frames: environment steps after which iteration stops; the last rollout is always
+            complete, so it may exceed them. -1: unlimited.
         seed: seed of the action noise.
         learner: its ``during_step`` runs during each step, its ``after_step`` after it.
 
@@ -153,7 +153,7 @@ class RolloutCollector(BaseCollector):
         return step
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
-        """Reseed the action noise and, if it has a ``reseed``, the environment.
+        """Reseed the action noise, and the environment if it has a method ``reseed``.
 
         The simulations keep their states. Returns the seed for the next collector: ``seed`` itself
         if ``static_seed``, else the next integer.

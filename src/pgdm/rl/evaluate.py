@@ -24,7 +24,8 @@ class EvalCfg:
     """How and how often a policy is evaluated."""
 
     episodes: int
-    """Episodes of the sampled policy in one evaluation."""
+    """Episodes of the sampled policy in one evaluation. The deterministic policy runs one episode,
+    or as many as the sampled one if the task is randomised."""
     interval_frames: int
     """Environment steps between two evaluations; 0: only before and after the training."""
     video: bool

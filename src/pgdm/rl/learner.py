@@ -42,7 +42,7 @@ class AlgoCfg:
     warm_start: bool
     """Whether the policy's mean starts at the environment's ``warm_start()``."""
     observation_clip: float
-    """Standardised observations are clipped here, standard deviations."""
+    """Standardised observations are clipped to plus or minus this many standard deviations."""
 
     def check(self, num_envs: int) -> None:
         """Check the settings, also against the number of simulations.
@@ -57,7 +57,7 @@ class AlgoCfg:
         return 2
 
     def memory_bytes(self, env: VecEnv, num_envs: int) -> int:
-        """Return the memory of a rollout and of the networks with Adam's averages, bytes."""
+        """Estimate the memory of a rollout, networks, gradients and Adam's averages, bytes."""
         widths = [env.obs_dim, *self.hidden, env.action_dim]
         weights = self.networks * sum(a * b for a, b in pairwise(widths))
         frame = 2 * (env.obs_dim + env.action_dim)
@@ -103,7 +103,11 @@ class Learner(Protocol):
         ...
 
     def during_step(self) -> None:
-        """Learn while the simulations take a step, from earlier steps only."""
+        """Learn while the simulations take a step, from earlier steps only.
+
+        Raises:
+            RunError: if a loss is not finite.
+        """
         ...
 
     def after_step(self, step: Mapping[str, Any]) -> None:

@@ -36,7 +36,7 @@ class NetworkCfg:
     normalize_observations: bool
     """Whether observations are standardised by their running statistics."""
     observation_clip: float
-    """Standardised observations are clipped here, standard deviations."""
+    """Standardised observations are clipped to plus or minus this many standard deviations."""
 
 
 class Gaussian(NamedTuple):
@@ -157,7 +157,7 @@ class SquashedCfg:
     log_std_init: float
     """Log of the initial standard deviation, before tanh."""
     observation_clip: float
-    """Standardised observations are clipped here, standard deviations."""
+    """Standardised observations are clipped to plus or minus this many standard deviations."""
 
 
 class SquashedPolicy(nn.Module):
@@ -166,7 +166,7 @@ class SquashedPolicy(nn.Module):
     Args:
         cfg: sizes and initial values.
         generator: stream of the initial weights; None leaves them uninitialised.
-        mean_bias: initial squashed mean (A,), or None for 0.
+        mean_bias: initial squashed mean (A,), clamped to +-0.95; None for 0.
     """
 
     def __init__(
@@ -197,7 +197,7 @@ class SquashedPolicy(nn.Module):
         return next(self.net.parameters()).device
 
     def forward(self, normalized: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation before tanh, (M, A), at (M, D) normalised."""
+        """Return mean and std before tanh, (M, A) each, at normalised observations (M, D)."""
         mean, log_std = precise_end(self.net, normalized).chunk(2, -1)
         return mean, log_std.clamp(*_LOG_STD_RANGE).exp()
 

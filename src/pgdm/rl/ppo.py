@@ -118,7 +118,8 @@ class PPOLearner:
         use the same ones.
 
         Raises:
-            RunError: if a loss or gradient is not finite; that gradient step is not taken.
+            RunError: if a loss, the gradient's norm or another logged value is not finite; that
+                gradient step is not taken.
         """
         with torch_threads(1):
             samples, metrics = self._prepare(rollout)
@@ -230,7 +231,8 @@ _LOGGED = {
     "ess": "ESS",
     "grad_norm": "norm",
 }
-"""Metrics logged as means over an iteration's gradient steps: name in the log, key in ``out``."""
+"""Metrics logged as means over an iteration's gradient steps: name in the log -> key in the results
+of `PPOLearner._policy_gradient`, completed by `PPOLearner._update`."""
 
 
 def _minibatch(samples: TensorDict, rows: Tensor, keys: Sequence[str]) -> dict[str, Tensor]:

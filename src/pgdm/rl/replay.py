@@ -45,7 +45,7 @@ class Replay:
     """Frames in the order in which they were seen, sampled uniformly.
 
     Each column is a file. Disk space is reserved in full at the start, so that a full disk is found
-    then and not in the middle of a run. Appended frames survive the death of the process. A
+    then and not in the middle of a run. Frames in the files survive the death of the process. A
     checkpoint holds the number of frames and a checksum of each column instead of a copy; frames
     appended after the checkpoint are overwritten when the run is resumed.
 
@@ -59,7 +59,7 @@ class Replay:
             written by ``state_dict`` only, not by every ``append``.
 
     Raises:
-        RunError: if the disk has no room for the files.
+        RunError: if the files cannot be created, for example on a full disk.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class Replay:
                 os.fsync(file.fileno())
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of frames and the checksum of each column."""
+        """Complete the files; return the number of frames and the checksum of each column."""
         for start in range(self._stored, len(self), _COPIED_FRAMES):
             new = slice(start, min(start + _COPIED_FRAMES, len(self)))
             rows = {name: self._live.get(name)[new].cpu() for name in self.columns}
@@ -138,14 +138,15 @@ class Replay:
         """Continue after the first ``frames`` frames of the files, as counted by the state.
 
         Raises:
-            CheckpointError: if the files do not hold these frames; files that this replay has
-                created are then deleted.
+            CheckpointError: if there are more frames than the capacity, or the files do not hold
+                them. If a file was missing at the start, the files created then are deleted.
         """
         frames, expected = int(state["frames"]), state["crc32"]
         where = self.folder or "the memory"
         if frames > self.capacity:
             raise CheckpointError(
-                f"the checkpoint has {frames:,} frames, {where} {self.capacity:,}"
+                f"the checkpoint has {frames:,} frames, but the replay in {where} has room for "
+                f"only {self.capacity:,}; resume with more total_frames"
             )
         if frames and self._made:
             for path in self._made:
@@ -206,7 +207,7 @@ def _reserve(folder: Path, columns: Mapping[str, Column], capacity: int) -> list
         The files that were missing.
 
     Raises:
-        RunError: if there is no room; the files are then as before.
+        RunError: if there is no room or no permission; the files are then as before.
     """
     sizes = {folder / f"{name}{_SUFFIX}": c.nbytes * capacity for name, c in columns.items()}
     before = {path: path.stat().st_size for path in sizes if path.exists()}

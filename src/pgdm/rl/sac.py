@@ -34,7 +34,7 @@ class SACCfg(AlgoCfg):
     reward_scale: float
     """Factor on the rewards in the learner's targets."""
     adam_betas: list[float]
-    """Adam's two decay rates, (2,) each 0..1."""
+    """Adam's two decay rates, each at least 0 and below 1."""
     critics: int
     """Number of critics; the lowest of their values is used."""
     target_rate: float
@@ -50,8 +50,8 @@ class SACCfg(AlgoCfg):
     target_entropy_end: float
     """Target entropy after ``target_entropy_frames``, reached linearly."""
     target_entropy_frames: int
-    """Environment steps over which the target entropy changes; fixed, so that extending a run does
-    not alter it."""
+    """Environment steps over which the target entropy changes. They do not depend on
+    ``total_frames``, so that extending a run does not alter the change."""
     temperature_init: float
     """Weight of the entropy in the return at the start."""
     warmup_steps: int
@@ -163,7 +163,7 @@ class SACLearner:
         self._logged: list[dict[str, Tensor]] = []
 
     def during_step(self) -> None:
-        """Make the updates of one control step.
+        """Make the updates of one control step; none during the first ``warmup_steps``.
 
         Raises:
             RunError: if a loss is not finite; that gradient step is not taken.

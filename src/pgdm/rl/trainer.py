@@ -122,7 +122,8 @@ class Trainer:
         extras: evaluation, checkpoints, schedules, callbacks, stop flag.
 
     Raises:
-        ConfigError: if the minibatches do not divide an iteration's samples.
+        ConfigError: if the learner's settings are invalid or do not fit the number of simulations.
+        RunError: if the files of the replay cannot be created, for example on a full disk.
     """
 
     def __init__(self, env: VecEnv, cfg: TrainerCfg, extras: Extras | None = None) -> None:

@@ -136,6 +136,9 @@ def randomized_geom(spec: mujoco.MjSpec, task: TaskCfg) -> str:
     body = spec.body(task.tracked_body)
     geoms = [] if body is None else [g for g in body.geoms if g.contype or g.conaffinity]
     if len(geoms) != 1:
-        raise SceneError(f"task '{task.id}': randomize needs one contact geom, found {len(geoms)}")
+        raise SceneError(
+            f"task '{task.id}': task.randomize needs exactly one contact geom on the "
+            f"tracked body, found {len(geoms)}"
+        )
     geoms[0].priority = RANDOMIZED_PRIORITY
     return geoms[0].name

@@ -192,9 +192,9 @@ class SimBatch:
         qfrc_bias (gravity and Coriolis forces) at the start of the step, for all substeps.
 
         Returns:
-            Whether each simulation diverged, (N,) bool: MuJoCo raised an error or a warning (bad
-            position, velocity or acceleration, no memory for contacts). The state of a diverged
-            simulation is meaningless; other simulations are unaffected.
+            Whether each simulation diverged, (N,) bool: MuJoCo raised an error or any warning (such
+            as a bad position, velocity or acceleration, or no memory for contacts). The state of a
+            diverged simulation is meaningless; other simulations are unaffected.
         """
         n = self._compensated
         self._f["ctrl"][:, self._actuators] = ctrl
@@ -234,7 +234,10 @@ class SimBatch:
         return self._d["xipos"][:, body].copy(), self._d["xquat"][:, body].copy()
 
     def push(self, body: int, force: np.ndarray, point: np.ndarray) -> None:
-        """Apply forces (N, 3) N to a body at points (N, 3) m, world frame, until the next reset."""
+        """Apply forces (N, 3) N to a body at points (N, 3) m, world frame.
+
+        They act until the next reset or the next push of this body.
+        """
         arm = point - self._d["xipos"][:, body]
         self._f["xfrc_applied"][:, body] = np.concatenate((force, np.cross(arm, force)), 1)
 
@@ -265,7 +268,7 @@ class SimBatch:
     ) -> None:
         """Set the object's friction (k, 3), half-width (k,) m and mass (k,) kg in simulations ids.
 
-        Its inertia is scaled with the mass; it does not follow the width (released code).
+        The object's inertia is scaled with the mass, but does not follow the width (released code).
         """
         geom, body, model = self._randomized_geom(), self.scene.index.object_body, self.scene.model
         self._batch.expand("geom_friction")[ids, geom] = friction

@@ -8,7 +8,7 @@ import numpy as np
 from pgdm.sim.scene import Scene
 
 FREE_M = 1e-4
-"""Penetration below which a hand counts as touching nothing."""
+"""Largest penetration at which a hand still counts as touching nothing, m."""
 FAR_M = 0.5
 """Upper bound of the fingertip distance."""
 
@@ -109,7 +109,10 @@ class FingertipDistance:
             self._links.append(np.flatnonzero(solid & (model.geom_bodyid == body)).tolist())
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
-        """Return the distances (F,) m of a state with current kinematics, negative on overlap."""
+        """Return the distances (F,) m of a state with current kinematics.
+
+        They are negative on overlap and at most ``FAR_M``.
+        """
         return np.array([self._least(data, link) for link in self._links])
 
     def _least(self, data: mujoco.MjData, link: list[int]) -> float:

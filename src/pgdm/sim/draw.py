@@ -133,7 +133,7 @@ def _write(task: IO[bytes], shots: Shots, first: int) -> None:
 
 
 def main() -> None:
-    """Draw the shots on stdin; write the pictures' raw bytes to stdout."""
+    """Read shots from stdin and draw them; write the pictures' raw bytes to stdout."""
     from mujoco.gl_context import GLContext  # of the backend that MUJOCO_GL names
 
     pipe = os.dup(sys.stdout.fileno())

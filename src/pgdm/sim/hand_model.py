@@ -21,7 +21,7 @@ RESET_KEY = "reset"
 """Keyframe of a hand's model with its reset pose; without it, the pose is all joints at zero."""
 
 _COUPLED_RAD = 0.01  # tolerance by which a joint may be outside its range, rad or m
-_SAMPLES = 101  # positions of a leader, spread over its range
+_SAMPLES = 101  # tested positions of a joint that another follows, spread over its range
 
 
 def joint_actuators(model: mujoco.MjModel, hand: HandCfg) -> np.ndarray:
@@ -35,7 +35,7 @@ def joint_actuators(model: mujoco.MjModel, hand: HandCfg) -> np.ndarray:
         hand: its hand.
 
     Raises:
-        SceneError: if a joint or actuator violates the requirements; the message names it.
+        SceneError: if a joint, actuator or equality constraint violates the requirements.
     """
     count = _check_joints(model, hand)
     _check_base(model, hand)
@@ -69,7 +69,8 @@ def reset_joints(model: mujoco.MjModel, hand: HandCfg, count: int) -> np.ndarray
     """Return the reset pose of a hand, (n,) m and rad: its keyframe ``RESET_KEY``, or all zero.
 
     Raises:
-        SceneError: if the keyframe moves the base, or another joint beyond its range.
+        SceneError: if the keyframe moves the base, or another joint beyond its range, by more than
+            0.01 rad or m.
     """
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, f"{hand.name}/{RESET_KEY}")
     if key < 0:
@@ -171,7 +172,9 @@ def _check_couplings(model: mujoco.MjModel, hand: HandCfg, count: int) -> np.nda
             raise _wrong(hand, f"{pair}, but the constraint is not active")
         if min(follower, leader) < len(BASE) or leader >= count or coupled[leader]:
             raise _wrong(
-                hand, f"{pair}; neither may be a base joint, and the latter must not follow another"
+                hand,
+                f"{pair}; neither may be a base joint, and the latter must be a joint of the hand "
+                "that follows no other",
             )
     if len(set(couplings.followers.tolist())) < len(couplings.rows):
         raise _wrong(hand, "a joint follows two others")
@@ -184,7 +187,7 @@ def _check_couplings(model: mujoco.MjModel, hand: HandCfg, count: int) -> np.nda
         raise _wrong(
             hand,
             f"joint '{_joint(model, couplings.followers[one])}' leaves its range by "
-            f"{over[one]:.3f} when '{_joint(model, couplings.leaders[one])}' goes to the end of "
+            f"{over[one]:.3f} when '{_joint(model, couplings.leaders[one])}' moves over "
             "its range: narrow the range of the latter",
         )
     return coupled
@@ -213,7 +216,9 @@ def _check_servo(model: mujoco.MjModel, hand: HandCfg, actuator: int) -> None:
         )
     low, high = model.actuator_ctrlrange[actuator]
     if not (model.actuator_ctrllimited[actuator] and low < high):
-        raise _wrong(hand, f"actuator '{name}' has no ctrlrange; give it that of its joint")
+        raise _wrong(
+            hand, f"actuator '{name}' has no ctrlrange, or an empty one; give it that of its joint"
+        )
 
 
 def _joint(model: mujoco.MjModel, joint: int | np.integer) -> str:

@@ -21,7 +21,8 @@ from pgdm.sim.marks import add_marks
 MAX_GEOMS = 2000
 GHOST_RGBA = np.array([0.15, 0.95, 0.45, 0.35], np.float32)
 HAND_ALPHA = 0.25  # opacity of the hand when marks are shown
-# In software OpenGL a 640x480 frame takes 75 ms with these settings, 230 ms with the scene's.
+# In software OpenGL a 640x480 picture takes 75 ms with the next three settings, 230 ms with the
+# scene's own.
 SHADOW_SIZE = 1024
 SAMPLES = 4
 SHADOW_SCALE = 0.1  # share of the light's cone with shadows: enough for the table

@@ -41,9 +41,9 @@ class PlacementCfg:
     body: str
     """Scene name of the body, such as ``door/frame``."""
     pos_m: list[float] | None
-    """Position in the world frame, (3,) m; None keeps the file's."""
+    """Position in the parent's frame (an outermost body: the world), (3,) m; None: the file's."""
     quat: list[float] | None
-    """Orientation in the world frame, (4,) wxyz; None keeps the file's."""
+    """Orientation in the same frame as ``pos_m``, (4,) wxyz; None: the file's."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class TaskCfg:
     objects: list[str]
     """Library names of the objects in the scene, in the order of their joints."""
     tracked_body: str
-    """Scene name of the tracked body, whose centre of mass and orientation should follow."""
+    """Scene name of the body whose centre of mass and orientation should follow the motion."""
     motion: str
     """Library id of the exemplar motion, which includes stored start states."""
     timestep_s: float
@@ -109,11 +109,11 @@ class HandCfg:
     human_fingers: list[str]
     """Human finger that each fingertip follows: index, middle, ring, little or thumb."""
     gravity_compensation: str
-    """Joints with gravity compensation: ``all`` actuated ones, or only the ``base``."""
+    """Joints with gravity compensation: ``all`` joints of the hand, or only the ``base``."""
     num_base_joints: int
     """Number of base joints, first in qpos, which move the hand as a whole."""
     num_wrist_joints: int
-    """Number of joints after them that turn the palm; the rest are the finger joints."""
+    """Number of joints after the base that turn the palm; the rest are the finger joints."""
     mean_fingers_rad: list[float]
     """Finger joints of the mean pre-grasp of the hand, in the order of qpos, rad."""
     mount_body: str
@@ -133,7 +133,7 @@ class SimCfg:
     """Iterations of the noslip solver per physics step."""
     object_mass: str
     """``volume``: mass and inertia of objects as MuJoCo 4.0 computes them from their volume;
-    ``published``: scaled to the masses that the MuJoCo of the paper's time computed."""
+    ``published``: scaled to those that the MuJoCo of the paper's time computed, where known."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class SceneIndex:
     num_joints: int  # n, of the hand; they are first in qpos
     num_actuators: int  # nu; less than n if joints are coupled
     driven: np.ndarray  # (nu,) the hand's joints that have an actuator, ascending
-    actuators: np.ndarray  # (nu,) their actuators' ids; actuator targets are in this order
+    actuators: np.ndarray  # (nu,) ids of the actuators of ``driven``; targets are in this order
     couplings: Couplings  # of the joints without actuator
     reset: np.ndarray  # (n,) m, rad: the reset pose
     num_compensated: int  # joints with gravity compensation, first in qvel
@@ -184,7 +184,7 @@ class Scene:
         return joints == _FREE_JOINTS
 
     def digest(self) -> str:
-        """Return a SHA-256 of everything that determines the physics."""
+        """Return a SHA-256 of the model's fields and options that determine the physics."""
         digest = hashlib.sha256()
         for name in _PHYSICS:
             digest.update(np.ascontiguousarray(getattr(self.model, name)).tobytes())

@@ -34,7 +34,7 @@ except ImportError as error:
     ) from error
 
 # Largest values over random rollouts of five scenes: 71 contacts and 462 constraint rows; means
-# are below 11 and 94. All simulations share one pool of contacts; the limit of rows is for each.
+# are below 11 and 94. All simulations share one pool of contacts; each has its own limit of rows.
 _CONTACTS_PER_SIM = 48
 _CONSTRAINT_ROWS = 512
 
