@@ -9,6 +9,8 @@ codes and vectors minus these means, W is the ridge regression
 
     W = X^T (X X^T + penalty var(X) I)^-1 Y
 
+with var(X) the total variance of the codes, taken as at least 0.5.
+
 Each object is held out in turn: the penalty is chosen for the least fingertip error on the held-out
 objects, and S is 0.7^2 times the second moment of the vectors' errors there. With some 40
 pre-grasps this predicts better than networks trained by gradient descent
