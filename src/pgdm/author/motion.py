@@ -43,8 +43,8 @@ class MotionRequest:
     poses: Path | None
     """Recorded poses: .csv, .npz or .json."""
     origin: str = "com"
-    """Point whose positions were recorded: ``com``, the centre of mass, or ``mesh``, the mesh file's
-    origin."""
+    """Point whose positions were recorded: ``com``, the centre of mass, or ``mesh``, the origin of
+    the mesh file."""
     smooth: bool = False
     """Filter the motion, and start and end it at rest."""
     slower: float = 1.0

@@ -22,7 +22,7 @@ LIFT_M = 0.02
 RAISE_M = 0.1
 """How far a policy raises the hand, unless a slide reaches its limit before."""
 PRESS_M = 0.03
-"""Largest distance that the hand moves in the palm's direction while it closes."""
+"""Largest distance that the hand moves in the direction that the palm faces, while it closes."""
 _SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # std: hand's shift; joints that bend no finger
 _PRESS_STEPS, _CLOSE_STEPS, _LIFT_STEPS, _HOLD_STEPS = 8, 20, 25, 15  # control steps
 _FASTEST, _SLOWEST = 4, 16  # control steps in which a finger closes

@@ -114,7 +114,8 @@ def _servo(
         else:
             name = model.joint(joint).name
             notes.append(
-                f"the actuator of '{name}' is not a position servo with gear 1; one replaces it"
+                f"the actuator of '{name}' is not a position servo with gear 1; such a one "
+                "replaces it"
             )
     given = gain is not None and kp is None
     gain = gain if given and gain is not None else (KP if kp is None else kp)

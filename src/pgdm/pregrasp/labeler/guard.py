@@ -1,4 +1,4 @@
-"""Restricts the labeler's server to its own page, opened on this machine.
+"""Keeps other machines, and pages of other sites, away from the labeler's server.
 
 This is the only module that uses viser's private interface, which may change with any version.
 """

@@ -37,7 +37,7 @@ PENALTIES = (0.3, 1.0, 3.0, 10.0, 30.0)
 SPREAD = 0.7
 """Standard deviation of the samples relative to that of the held-out errors. Less than 1, because
 among few candidates those far from the mean are rarely the best: the fingertip error of the best of
-8 is 36 mm, and 38 mm with 1."""
+8 candidates is 36 mm with this value, and 38 mm with 1."""
 LEAST_OBJECTS = 2
 _LEAST_VARIANCE = 0.5
 """Lower bound of the codes' total variance in the ridge penalty. The variance of 32 objects is 3.4,
