@@ -108,7 +108,7 @@ def test_a_recording_is_blended_to_start_where_the_object_rests(recorded: Path) 
     assert made.motion.poses.pos[0, 2] == pytest.approx(0.06, abs=1e-3)
     assert made.motion.poses.pos[-1, 2] == pytest.approx(0.063 + line(0.3, 40)[-1, 0])
     assert made.motion.notes[0].startswith("the columns have no names and were read as x y z qw")
-    assert made.motion.notes[1].startswith("its first 0.6 s were blended to start where")
+    assert made.motion.notes[1].startswith("the motion's first 0.6 s were blended to start where")
     assert (made.pregrasp.qpos[:16] == 0).all()
 
 

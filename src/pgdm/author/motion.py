@@ -22,8 +22,8 @@ from pgdm.library.files.keyframes import STEP_S, continuous
 ORIGINS = ("com", "mesh")
 
 NEAR_M, NEAR_RAD = 0.01, 0.17
-"""Distance between first pose and resting pose up to which the motion is blended to start at rest;
-if they are farther apart, ``--settle`` is needed."""
+"""Distance and angle between first pose and resting pose up to which the motion is blended to start
+at rest; if they are farther apart, ``--settle`` is needed."""
 _BLEND_STEPS = 15  # control steps of the blend
 _NAME_THEM = (
     "name the columns: a first line x,y,z,qx,qy,qz,qw in a .csv, 'columns' in a .json or .npz"
@@ -43,7 +43,8 @@ class MotionRequest:
     poses: Path | None
     """Recorded poses: .csv, .npz or .json."""
     origin: str = "com"
-    """Point whose positions were recorded: ``com`` or ``mesh``, the mesh file's origin."""
+    """Point whose positions were recorded: ``com``, the centre of mass, or ``mesh``, the origin of
+    the mesh file."""
     smooth: bool = False
     """Filter the motion, and start and end it at rest."""
     slower: float = 1.0
@@ -51,7 +52,8 @@ class MotionRequest:
     lift: bool = False
     """Raise poses that cut into the table."""
     settle: bool = False
-    """Shift the whole motion to where the object comes to rest, however far that is."""
+    """Start where the object comes to rest, however far that is: shift all positions by one vector,
+    and turn the object by one rotation in all poses, about its own axes."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,8 @@ def make_motion(
         body: id of the object's body in the scene.
 
     Raises:
-        ConfigError: the options exclude each other, or the motion is impossible; the message then
-            names the pose and a remedy.
+        ConfigError: there is not exactly one motion, ``origin`` does not fit it, or the motion is
+            impossible; the message then states a remedy.
         CorruptAssetError: the motion's file is damaged.
     """
     if (request.keyframes is None) == (request.poses is None):
@@ -123,8 +125,8 @@ def _animated(path: Path, object_xml: Path, notes: list[str]) -> Poses:
     _check_rest(rest, str(path))
     if rest.turned_rad > NEAR_RAD:
         notes.append(
-            f"the object falls over from this pose, by {np.rad2deg(rest.turned_rad):.0f} degrees; "
-            "the motion starts where it comes to rest"
+            "the object falls over from the pose in which it is put on the table, by "
+            f"{np.rad2deg(rest.turned_rad):.0f} degrees; the motion starts where it comes to rest"
         )
     return Poses(*animation.at(rest.com, rest.quat))
 
@@ -156,8 +158,8 @@ def _started_at_rest(
     place = float(poses.pos[0, 0]), float(poses.pos[0, 1])
     if max(abs(place[0]), abs(place[1])) > _TABLE_M:
         raise ConfigError(
-            f"{label}: starts at x = {place[0]:.2f}, y = {place[1]:.2f} m, off the table, which "
-            f"reaches to {_TABLE_M:g} m"
+            f"{label}: starts at x = {place[0]:.2f}, y = {place[1]:.2f} m, off the table or near "
+            f"its edge; valid: at most {_TABLE_M:g} m from the centre in x and in y"
         )
     rest = drop(object_xml, place, first)
     _check_rest(rest, label)
@@ -166,18 +168,18 @@ def _started_at_rest(
         raise ConfigError(
             f"{label}: the object does not rest where the motion starts: it settles "
             f"{100 * away:.1f} cm away, turned by {np.rad2deg(rest.turned_rad):.0f} degrees; "
-            "--settle shifts the motion to where it rests"
+            "--settle shifts and turns the motion to start where the object rests"
         )
     turn = Rotation.from_quat(rest.quat, scalar_first=True) * first.inv()
     turns = Rotation.from_quat(poses.quat, scalar_first=True)
     if settle:
-        notes.append(f"shifted by {1e3 * away:.0f} mm to where the object rests")
+        notes.append(f"shifted by {1e3 * away:.0f} mm, and turned, to start where the object rests")
         quat = (turns * first.inv() * turn * first).as_quat(scalar_first=True)
         return Poses(poses.pos - poses.pos[0] + rest.com, continuous(quat))
     if away > 1e-4 or rest.turned_rad > 1e-3:
         notes.append(
-            f"its first {_BLEND_STEPS * STEP_S:.1f} s were blended to start where the object "
-            f"rests, {1e3 * away:.1f} mm and {np.rad2deg(rest.turned_rad):.1f} degrees away"
+            f"the motion's first {_BLEND_STEPS * STEP_S:.1f} s were blended to start where the "
+            f"object rests, {1e3 * away:.1f} mm and {np.rad2deg(rest.turned_rad):.1f} degrees away"
         )
     share = np.clip(1.0 - np.arange(len(poses.pos)) / _BLEND_STEPS, 0.0, 1.0)
     share = share**3 * (10 - 15 * share + 6 * share**2)  # minimum-jerk blend from 1 to 0
@@ -189,6 +191,7 @@ def _started_at_rest(
 def _check_rest(rest: Drop, label: str) -> None:
     if not rest.rests:
         raise ConfigError(
-            f"{label}: the object does not come to rest on the table from this pose "
-            f"({100 * rest.speed_m_s:.1f} cm/s after 4 s); turn it so that it lies stably"
+            f"{label}: the object does not come to rest on the table from its starting "
+            f"pose: after 4 s it moves at {100 * rest.speed_m_s:.1f} cm/s, or turns, drifts or has "
+            "sunk too far; turn it so that it lies stably"
         )

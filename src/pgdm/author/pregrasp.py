@@ -30,7 +30,7 @@ SLACK_M, SLACK_RAD = 0.03, 0.2
 and the policy's corrections can compensate for that much."""
 _TOUCH_M = 1e-4
 _SLIDES = 3  # the first joints of the base
-_HAND_M = 0.3  # if the object turns, the base may have to travel this much less
+_HAND_M = 0.3  # if the object turns, the base may travel this much less than the object
 _CURE = "shorten the motion, or put the object elsewhere (place in the keyframes)"
 _COMPARED = 5  # poses that are lift-tested
 
@@ -57,7 +57,8 @@ def make_pregrasp(
 
     Args:
         choice: ``mean`` or ``open`` (a search with the fingers near that posture), ``later`` (the
-            hand's reset pose), a pre-grasp's file, or a task (a search near its finger pose).
+            hand's reset pose), the path of a ``.npz`` pre-grasp, or the id of a task of the
+            same hand (a search near the finger pose of its mined pre-grasp).
         scene: scene of the new task.
         qpos: positions of the whole scene (nq,), with the object at rest.
         poses: the task's motion.
@@ -116,7 +117,10 @@ def _check_travel(scene: Scene, poses: Poses) -> None:
 
 
 def _firmest(scene: Scene, poses: list[NearPose], progress: StepProgress) -> FoundPregrasp:
-    """Return, of the nearest poses, the one from which most random closings lift the object."""
+    """Return, of the nearest poses, the one from which most random closings lift the object.
+
+    If the object cannot be lifted, return the nearest pose.
+    """
     lift, still = LiftTest(scene, SUBSTEPS), np.zeros(scene.model.nv)
     tested = counted("lift tests", poses[:_COMPARED], progress)
     rates = [lift(Start(pose.qpos, still, None)) for pose in tested]
@@ -175,7 +179,7 @@ def _fingers(choice: str, scene: Scene, library: Library) -> np.ndarray:
     entry = library.entry(choice)
     if entry.hand != scene.hand.name or "mined" not in entry.starts:
         raise ConfigError(
-            f"--pregrasp '{choice}': its pre-grasp is for hand '{entry.hand}', this task's hand is "
-            f"'{scene.hand.name}'"
+            f"--pregrasp '{choice}' is a task of hand '{entry.hand}'; give one that has a mined "
+            f"pre-grasp of hand '{scene.hand.name}'"
         )
     return library.motion(choice).starts["mined"].qpos[first : scene.index.num_joints]

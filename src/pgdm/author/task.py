@@ -60,7 +60,7 @@ class AuthoredTask:
     motion: CheckedMotion
     pregrasp: FoundPregrasp
     plan: ReachPlan | None
-    """Reach plan, stored if it reaches the pre-grasp; None if there is no pre-grasp."""
+    """Reach plan, stored if it reaches the pre-grasp; None if the start is the reset pose."""
     motion_path: Path
     task_path: Path
 
@@ -81,8 +81,8 @@ def author_task(
         progress: reports the search for a pre-grasp, its lift tests and the reach plan.
 
     Raises:
-        ConfigError: a name is unknown or taken, the motion is impossible, or the hand cannot follow
-            it.
+        ConfigError: a name is unknown or taken, an option is wrong, the pre-grasp does not fit, the
+            motion is impossible, or the hand cannot follow it.
         SceneError: every pre-grasp that the search found touches something.
         CorruptAssetError: a file is damaged.
         LibraryError: the user's folder cannot be written.

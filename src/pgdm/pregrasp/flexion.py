@@ -9,9 +9,9 @@ from pgdm.pregrasp.hand_geometry import opposing_finger, straight, unit
 from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
 
-_SAMPLES = 21  # angles tried between a joint's zero and each of its limits
+_SAMPLES = 21  # angles tried from a joint's straight position to each of its limits
 _LEAST_M = 0.01  # a thumb joint closes only if it brings the tip nearer to the palm by more
-_BENDS = 0.5  # other joints close if the tip's motion has this cosine to the palm's normal, or more
+_BENDS = 0.5  # other joints close if the tip's motion has a larger cosine to the palm's normal
 
 
 class Flexion:
@@ -44,7 +44,8 @@ class Flexion:
         centre = 0.5 * (knuckles.mean(0) + wrist)  # of the palm, (3,) m, with straight fingers
         normal = self._normal(knuckles.mean(0), centre)
         self.closed = self._closed(normal, centre)
-        """Angle of each finger joint when closed, (J,) rad; NaN for joints that close nothing."""
+        """Angle of each finger joint when closed, (J,) rad; NaN for joints that do not bend a
+        finger towards the palm, such as those that spread the fingers."""
         data = self._at(self._straight)
         rotation = data.xmat[self._palm].reshape(3, 3)
         self.normal = normal @ rotation

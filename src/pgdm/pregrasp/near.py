@@ -37,7 +37,8 @@ from pgdm.sim.contact import FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
 CLEARANCE_M = 0.003
-"""Distance from everything else that the search aims for; returned poses at least do not touch."""
+"""Distance between the hand and everything else that the search aims for. In returned poses it may
+be less, but the hand touches nothing else."""
 TIP_DISTANCE_M = 0.015
 """Desired distance of the fingertips from the object."""
 
@@ -207,7 +208,7 @@ class _Search:
 
 
 class _Tendons:
-    """How far joints exceed the range of limited tendons, where servos cannot bring them.
+    """How far joints exceed the ranges of limited tendons: servos cannot bring them there.
 
     Args:
         model: a model; only fixed tendons count, whose length is a weighted sum of joint angles.
@@ -222,7 +223,7 @@ class _Tendons:
         self._range = model.tendon_range[self._which]
 
     def beyond_rad(self, data: mujoco.MjData) -> float:
-        """Return the excess summed over tendons, as the angle of each one's longest-arm joint."""
+        """Return the sum over tendons of excess length divided by the tendon's largest arm, rad."""
         length = data.ten_length[self._which]
         over = np.maximum(self._range[:, 0] - length, length - self._range[:, 1]).clip(0.0)
         return float((over / self._arms).sum())

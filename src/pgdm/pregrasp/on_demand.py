@@ -2,7 +2,7 @@
 
 Three pre-grasp sources qualify: ``mocap``, from a human hand's joints; ``planned``, for a hand that
 is not the task's own, obtained in the same way; and ``learned``, once the user has trained a
-predictor for the hand. If a reach plan succeeds, the start is the state in which it ends.
+predictor for the hand. If a reach plan is accepted, the start is the state in which it ends.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from pgdm.pregrasp.retarget.recording import Recording
 from pgdm.sim.scene import HandCfg, Scene, SimCfg, TaskCfg, build_scene
 
 DEEPER_M = 0.001
-"""A reach plan is rejected if it ends in a deeper penetration than this, or the pre-grasp's."""
+"""A reach plan is rejected if it ends in a penetration deeper than both this and the
+pre-grasp's."""
 FARTHEST = 3.0
 """A reach plan is rejected if its error exceeds this many times the reach's tolerances."""
 
@@ -81,7 +82,7 @@ def ensure_start(
     """Compute and store a start state, if it is missing and can be computed.
 
     If several processes need the same start state, one computes it and the others wait. The result
-    depends only on the assets.
+    depends only on the assets and, for ``learned``, on the predictor.
 
     Args:
         library: library with the task.
@@ -89,11 +90,12 @@ def ensure_start(
         offline: never download the human hand's joints.
         notify: receives messages on what is computed and how well it fits; by default the log.
         progress: receives the progress.
-        num_threads: number of threads of the reach planner; 0 takes one per core. The result does
-            not depend on it.
+        num_threads: number of threads of the simulations; 0 takes one per core. The result does not
+            depend on it.
 
     Raises:
-        ConfigError: the hand cannot do the task.
+        ConfigError: the hand cannot do the task, there is neither a human hand nor a pre-grasp to
+            follow, or no pre-grasp can be predicted for the object.
         SceneError: no predicted pose can be freed from contact, or the simulation diverges.
         CorruptAssetError: the predictor's file is damaged.
         LibraryError: something is missing and cannot be downloaded, or the start cannot be stored.
@@ -130,7 +132,10 @@ def ensure_start(
 def human_hand(
     library: Library, wanted: Wanted, motion: Motion, offline: bool, notify: Notify
 ) -> Recording:
-    """Return the human hand to follow; it is downloaded if available but not in the library.
+    """Return the human hand to follow.
+
+    If the library lacks it, it is downloaded, unless it would have to be rebuilt from another
+    package. If there is none, the points of the task's own hand in its pre-grasp are followed.
 
     Raises:
         ConfigError: the task has neither a human hand nor a pre-grasp of its own to follow.

@@ -22,11 +22,11 @@ LIFT_M = 0.02
 RAISE_M = 0.1
 """How far a policy raises the hand, unless a slide reaches its limit before."""
 PRESS_M = 0.03
-"""Largest distance that the hand moves in the palm's direction while it closes."""
-_SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # std: hand's shift; joints that only spread the fingers
+"""Largest distance that the hand moves in the direction that the palm faces, while it closes."""
+_SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # std: hand's shift; joints that bend no finger
 _PRESS_STEPS, _CLOSE_STEPS, _LIFT_STEPS, _HOLD_STEPS = 8, 20, 25, 15  # control steps
 _FASTEST, _SLOWEST = 4, 16  # control steps in which a finger closes
-_GRIP, _FINGER, _JOINT = (0.3, 1.0), (0.5, 1.0), (0.7, 1.3)  # factors of full flexion
+_GRIP, _FINGER, _JOINT = (0.3, 1.0), (0.5, 1.0), (0.7, 1.3)  # ranges of factors of full flexion
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def quality(scene: Scene, qpos: np.ndarray, substeps: int, lift: LiftTest | None
 
 
 def _can_rise(scene: Scene) -> bool:
-    """Return whether the object can move up: whether it has a joint that is not a hinge."""
+    """Return whether the object can move up: whether it or an ancestor has a non-hinge joint."""
     model, body = scene.model, scene.index.object_body
     while body:
         first = model.body_jntadr[body]

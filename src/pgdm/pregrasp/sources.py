@@ -64,7 +64,8 @@ class StartState:
 def start_state(cfg: PregraspCfg, motion: Motion, scene: Scene) -> StartState:
     """Return the start state of a task.
 
-    With ``none`` the objects are where the mined pre-grasp has them.
+    With ``none`` the objects are where the mined pre-grasp has them; if there is no mined one,
+    where the motion's first stored start has them.
 
     Raises:
         ConfigError: the source is unknown or not stored for this task, or the stored state does
@@ -114,7 +115,10 @@ def _stored(source: str, motion: Motion, scene: Scene) -> StartState:
 
 
 def _reach(start: Start, pose: np.ndarray, scene: Scene) -> ReachStart | None:
-    """Return the plan of a stored start, if any; at its begin objects are as in ``pose`` (nq,)."""
+    """Return the plan of a stored start; at its beginning the objects are as in ``pose`` (nq,).
+
+    Returns None if there is no plan, or if it is for another hand.
+    """
     if start.actions is None or start.actions.shape[1] != scene.model.nu:
         return None
     return ReachStart(reset_pose(scene, pose), np.array(start.actions))
@@ -137,7 +141,7 @@ def reset_pose(scene: Scene, qpos: np.ndarray) -> np.ndarray:
 
 
 def is_reset_pose(scene: Scene, qpos: np.ndarray) -> bool:
-    """Return whether the hand is in its reset pose at qpos (nq,), which is no pre-grasp."""
+    """Return whether the hand is in its reset pose at qpos (nq,); that is not a pre-grasp."""
     return np.array_equal(qpos[: scene.index.num_joints], scene.index.reset)
 
 
@@ -163,7 +167,7 @@ def reset_state(motion: Motion, scene: Scene) -> np.ndarray:
 
 
 def _within_limits(start: StartState, scene: Scene) -> StartState:
-    """Return a start state; raise ConfigError if it exceeds limits by ``LIMIT_TOLERANCE``."""
+    """Return a start state; raise ConfigError if it exceeds limits by over ``LIMIT_TOLERANCE``."""
     model, count = scene.model, scene.index.num_joints
     hand = start.qpos[:count]
     low, high = model.jnt_range[:count].T

@@ -1,1 +1,1 @@
-"""Wrist paths and wrist plans: base joint positions that let the hand follow a motion."""
+"""Wrist paths and wrist plans: targets of the base joints that let the hand follow a motion."""

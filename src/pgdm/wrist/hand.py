@@ -1,4 +1,4 @@
-"""Simulation of the hand alone: it touches no object, but may bear the weight of the task's."""
+"""Simulation of the hand alone: it touches no object, but may bear an object's weight."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class HandAlone:
     """Simulates the hand of a wrist-plan problem without contact with objects.
 
     Args:
-        problem: gives the start state, the finger targets and the load.
+        problem: gives the motion, the start state, the finger targets and the load.
         scene: the problem's scene, with the objects' contacts switched off.
     """
 

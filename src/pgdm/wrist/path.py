@@ -19,13 +19,17 @@ SLIDES, BASE_JOINTS = 3, 6
 frame, which is the frame of the mount body with all base joints at zero."""
 
 TURN_M = 0.03
-"""Position error, m, that costs as much as 1 rad between the hand's and the carried orientation."""
+"""Position error, m, that costs as much as 1 rad between the hand's orientation and that of the
+carried path."""
 _STEADY_M = 0.003  # position error, m, that costs as much as a hinge change of 1 rad in one step
 
 
 @dataclass(frozen=True)
 class GraspPoint:
-    """The point of the hand where the object's centre of mass is at the start."""
+    """The point of the hand that is at the motion's first target at the start.
+
+    The object's centre of mass should be there, too.
+    """
 
     offset: np.ndarray  # (3,) m, in the frame of the body that the point is fixed to
 
@@ -81,17 +85,19 @@ def clipped_path(index: SceneIndex, reference: ObjectReference, start: Tensor) -
 
 
 def feasible_path(index: SceneIndex, reference: ObjectReference, start: Tensor) -> Tensor:
-    """Return base joint positions (T, 6) within the control ranges, with the grasp point on target.
+    """Return base joint positions (T, 6), within the control ranges, that follow the motion.
 
-    With x the target in the mount's frame, o the grasp point in the mount body's frame, a the three
-    hinge angles and R(a) their rotation, the slides follow from the hinges: s(a) = x - R(a) o. Each
-    step is a bounded least-squares problem in a,
+    The grasp point is on target, or as near to it as the ranges allow.
+
+    With x the target position in the mount's frame, o the grasp point in the mount body's frame, a
+    the three hinge angles and R(a) their rotation, the slides follow from the hinges:
+    s(a) = x - R(a) o. Each step is a least-squares problem in a, bounded by the hinges' ranges,
 
         min  |s - clip(s)|^2 + |TURN_M log(R_carried^-1 R(a))|^2 + |0.003 (a - a_before)|^2
 
-    in m and rad: position has priority over the carried orientation, and that over a small change
-    since the previous step. The solver starts once from the previous step's hinges and once from
-    the carried path's; the better result is kept.
+    in m and rad, where clip limits s to the slides' ranges: position has priority over the carried
+    orientation, and that over a small change since the previous step. The solver starts once from
+    the previous step's hinges and once from the carried path's; the better result is kept.
 
     Args:
         index: index of the scene.

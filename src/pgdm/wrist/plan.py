@@ -17,7 +17,7 @@ from pgdm.wrist.search import REAL_STAGE, SMOOTH_STAGE, Search
 __all__ = ["WristPlan", "WristProblem", "plan_wrist", "simulate"]
 
 NEAR_M = 0.01
-"""A step counts towards the rigid grasp if its error is below this, the threshold of success."""
+"""A step counts towards the rigid grasp if its error is at most this, the same as for success."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ def plan_wrist(
 
 
 def simulate(problem: WristProblem, commands: np.ndarray) -> WristPlan:
-    """Simulate the hand alone with commands (T-1, 6), and return them as a plan."""
+    """Simulate the hand alone with commands (T-1, 6), and return commands and motion as a plan."""
     rollout = HandAlone(problem, hand_alone(problem.scene)).rollout(commands)
     errors = np.linalg.norm(rollout.points - problem.reference.pos.numpy()[1:], axis=1)
     qpos, fingers_end = rollout.qpos.copy(), problem.scene.index.num_joints
-    qpos[:, fingers_end:] = problem.qpos[fingers_end:]  # unsupported objects fell
+    qpos[:, fingers_end:] = problem.qpos[fingers_end:]  # in simulation the objects fell
     return WristPlan(commands, qpos, errors)

@@ -36,7 +36,7 @@ class WristProblem:
     """Physics steps per control step."""
     hold_steps: int = 0
     """Control steps for which the hand waits at its start while the fingers close. In as many steps
-    after that, errors cost nothing, so that the hand can catch up."""
+    after that, tracking errors cost nothing, so that the hand can catch up."""
     bears_load: bool = False
     """Whether the hand carries the object's weight once the motion lifts the object. Gravity
     compensation does not cover that weight, only the hand's."""
@@ -67,7 +67,8 @@ class WristProblem:
     def load_n(self) -> np.ndarray:
         """Return the load at each step, (T,) N: m g clip((z_k - z_0) / 2 cm, 0, 1).
 
-        It is zero without ``bears_load``, and for an object that is attached to something.
+        z_k is the height of the target that the hand should follow at step k. The load is zero
+        without ``bears_load``, and for an object that is attached to something.
         """
         scene, height = self.scene, self.reference.pos.numpy()[self.target_steps(), 2]
         if not (self.bears_load and scene.lies_free):

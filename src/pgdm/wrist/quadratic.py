@@ -10,7 +10,8 @@ from qpsolvers import solve_qp
 from pgdm.wrist.path import BASE_JOINTS
 
 PER_LIMIT = np.repeat((300.0, 90.0), 3)
-"""Residual per excess over a joint limit, 1/m for slides, 1/rad for hinges: 1 at 3 mm, 0.01 rad."""
+"""Residual per excess over a joint limit, 1/m for slides, 1/rad for hinges: about 1 at 3 mm or
+0.01 rad."""
 _TINY, _SAME = 1e-9, 1e-6  # _SAME: m and rad, changes closer than this are equal
 _LIMIT_ROUNDS = 6
 
@@ -32,7 +33,8 @@ class Limits:
 
 
 class Model:
-    """The cost of a change d (K * 6,) of the commands, where L is ``PER_LIMIT``:
+    """The cost of a change d (K * 6,) of the commands, where L is ``PER_LIMIT`` and clip
+    limits joint positions to ``limits``:
 
         |r + J d|^2 + |L (q + B d - clip(q + B d))|^2
 
@@ -62,7 +64,8 @@ class Model:
 
         Each round solves min 1/2 d'Hd + g'd with low <= d <= high. The limit term is included only
         for joints that the previous round's change takes beyond a limit. Rounds end when the change
-        stays the same, or after six; the change of least cost is returned.
+        stays the same, when the solver fails, or after six. Of these changes, and no change at
+        all, that of least cost is returned.
         """
         low, high = low.ravel(), np.maximum(high, low + _TINY).ravel()
         best = step = np.zeros_like(low)

@@ -1,11 +1,13 @@
 r"""Gauss-Newton on the commands of all control steps at once, with finite-difference derivatives.
 
 The base's servos are soft and underdamped: if a path is sent to them unmodified, the hand lags and
-overshoots by centimetres. The search therefore minimises over all commands together. Let u_k be the
-targets of the six base joints at step k = 0..K-1, and q_k the base joint positions after that step.
-Let g_k be the grasp point (a point fixed to the palm, where the object's centre of mass is at the
-start) and R_k the palm's orientation, with targets x_k and R*_k, and p the feasible path of
-`pgdm.wrist.path`. The cost is
+overshoots by centimetres. The search therefore minimises over all commands together. Control step
+k = 0..K-1 leads to pose k+1 of the motion. In this step, u_k are the targets of the six base
+joints; after it, q_k are the base joint positions, R_k is the palm's orientation, and g_k the grasp
+point (a point fixed to the palm, at the motion's first target at the start). p_k is pose k+1 of the
+feasible path of `pgdm.wrist.path`, and u_{-1} = p_{-1}. The target x_k is the position in pose k+1
+of the motion, and R*_k the palm's orientation in pose k+1 of the feasible path; during a hold both
+are those of pose 0. The cost is
 
     sum_k  w_k |100 (g_k - x_k)|^2  +  w_k |0.9 log(R*_k^-1 R_k)|^2      follow the motion
            + |C (u_k - u_{k-1})|^2  +  |0.2 C (u_k - p_k)|^2             smooth, near the path
@@ -21,8 +23,8 @@ control step, F = df/ds and G = df/du by one-sided finite differences. The chain
     S_0 = 0,   S_{k+1} = F_k S_k + G_k E_k,   S = ds/du,   E_k u = u_k
 
 and with it the residuals' Jacobian; `quadratic.Model` then computes the step d subject to
-max(low - u, -trust) <= d <= min(high - u, trust). The trust region grows and shrinks with the ratio
-of actual to predicted decrease.
+max(low - u, -trust) <= d <= min(high - u, trust), with the control range from low to high. The
+trust region grows and shrinks with the ratio of actual to predicted decrease.
 """
 
 from __future__ import annotations
@@ -44,8 +46,8 @@ from pgdm.wrist.path import BASE_JOINTS, SLIDES, base_orientation, feasible_path
 from pgdm.wrist.problem import WristProblem
 from pgdm.wrist.quadratic import Limits, Model
 
-# These cost the same: the grasp point 1 cm off target, the palm 1.1 rad off target, or a joint 3 mm
-# or 0.01 rad inside its margin (`quadratic.PER_LIMIT`).
+# These cost about the same: the grasp point 1 cm off target, the palm 1.1 rad off target, or a
+# joint 3 mm or 0.01 rad inside its margin (`quadratic.PER_LIMIT`).
 _PER_M, _PER_RAD = 100.0, 0.9
 _MARGIN = np.repeat((0.005, 0.03), SLIDES)  # m and rad: distance of joints from their limits
 _CHANGE, _NEAR_PATH = np.repeat((2.0, 0.6), SLIDES), 0.2

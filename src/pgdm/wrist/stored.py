@@ -32,7 +32,8 @@ class WristPlans:
     Args:
         library: the library's folder.
         run: the run's folder; None without a run.
-        notify: called with a sentence when a plan is computed, missing or damaged.
+        notify: called with a sentence when a plan is missing, unusable or computed, when it cannot
+            be stored, and when another process is computing it.
         progress: called with the planner's progress; with None, missing plans are not computed.
         num_threads: number of threads of the planner; 0 takes one per core.
     """
@@ -119,17 +120,20 @@ def read(path: Path, problem: WristProblem, any_version: bool = False) -> WristP
     Args:
         path: path of the file.
         problem: the problem that the plan is for.
-        any_version: accept a plan for the same start state even if the problem's hash differs.
+        any_version: accept any plan of the same length and start state, whatever its hash.
 
     Raises:
-        CorruptAssetError: the file is missing, damaged, or for another problem.
+        CorruptAssetError: the file is missing, damaged, for another problem, or, unless
+            ``any_version``, from another version of planner or MuJoCo.
     """
     arrays = safe_npz.read_npz(path)
     steps, nq = len(problem.reference) - 1, problem.scene.model.nq
     shapes = {"commands": (steps, 6), "qpos": (steps + 1, nq), "error_m": (steps,), "effort": (2,)}
     for name, shape in shapes.items():
         if not _is_finite(arrays.get(name), shape):
-            raise CorruptAssetError(f"{path}: '{name}' is not {shape} finite numbers")
+            raise CorruptAssetError(
+                f"{path}: '{name}' must be finite float64 numbers of shape {shape}"
+            )
     same_start = np.array_equal(arrays["qpos"][0], problem.qpos)
     if not (same_start and (any_version or np.array_equal(arrays.get("key", []), _key(problem)))):
         raise CorruptAssetError(

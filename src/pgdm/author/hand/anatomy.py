@@ -87,7 +87,8 @@ def find(model: mujoco.MjModel, chosen: Mapping[str, str], label: str) -> Anatom
 
     Raises:
         ConfigError: the hand does not have three to five fingers, the hand is on an arm, two
-            fingers share a joint, or ``chosen`` does not fit.
+            fingers share a joint, a fingertip has no collision geometry, or ``chosen`` does not
+            fit.
     """
     moved = model.body_jntnum > 0
     parents = model.body_parentid
@@ -177,8 +178,9 @@ def _chosen(
         with_it = [i for i, known in enumerate(names) if name in known]
         if len(with_it) != 1 or with_it[0] in found:
             raise ConfigError(
-                f"{label}: --fingers {human}={name} does not identify one finger; the last links "
-                f"are {_listed(_name(model, tip) for tip in tips)}"
+                f"{label}: --fingers {human}={name} must name a link or joint of exactly one "
+                "finger that no other name refers to; the fingers' last links are "
+                f"{_listed(_name(model, tip) for tip in tips)}"
             )
         found[with_it[0]] = human
     if len(found) < len(tips) or "thumb" not in found.values():
@@ -191,7 +193,7 @@ def _chosen(
 
 
 def _by_words(names: set[str]) -> str | None:
-    """Return the human finger that most names of a finger point to; None if none or several do."""
+    """Return the human finger that most of a finger's names point to; None if none or a tie."""
     counts = {
         human: sum(any(_says(name.lower(), word) for word in words) for name in names)
         for human, words in _WORDS.items()
@@ -245,9 +247,11 @@ def _end(model: mujoco.MjModel, data: mujoco.MjData, tip: int, label: str) -> np
 def _middle(
     model: mujoco.MjModel, data: mujoco.MjData, joints: list[int], number: int
 ) -> np.ndarray:
-    """Return a finger joint's anchor (3,) m, shifted along its axis to the middle of its link.
+    """Return a joint's anchor (3,) m, shifted along its axis to the middle of its link.
 
-    A file may put the anchor anywhere along a hinge's axis, such as at the side of the link.
+    A file may put the anchor anywhere along a hinge's axis, such as at the side of the link. If the
+    axis runs along the link, the anchor stays. If the link has no collision geometry, the next link
+    of the finger that has some takes its place.
     """
     joint = joints[number]
     anchor, axis = data.xanchor[joint], data.xaxis[joint]

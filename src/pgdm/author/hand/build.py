@@ -63,7 +63,8 @@ class Plan:
     ranges: dict[str, tuple[float, float]]
     """Ranges of joints that were narrowed."""
     plain_surface: bool
-    """Whether the geoms get the benchmark's friction: URDF states none."""
+    """Whether colliding geoms get the benchmark's friction, contact dimension and margin: URDF has
+    none."""
     reset: dict[str, float]
     """Reset positions, rad or m, of the joints where it is not zero."""
     excluded: list[tuple[str, str]]
@@ -85,10 +86,13 @@ def named(xml: str) -> mujoco.MjSpec:
 
 
 def light(xml: str) -> str:
-    """Return a hand without geoms that do not collide, whose meshes take long to compile."""
+    """Return a hand with its colliding geoms only: other geoms' meshes take long to compile.
+
+    Masses and inertias stay.
+    """
     spec = named(xml)
     model = spec.compile()
-    for body in spec.bodies[1:]:  # not the world; mass may come from geoms that are deleted below
+    for body in spec.bodies[1:]:  # without the world; geoms that are deleted below may give mass
         whole = model.body(body.name)
         if whole.mass[0] > 0:
             body.explicitinertial, body.fullinertia = True, [math.nan] * 6

@@ -101,7 +101,7 @@ def check(scene: Scene, excluded: list[tuple[str, str]], mean: np.ndarray) -> Ch
         body = int(model.jnt_bodyid[joint])
         if model.body_subtreemass[body] <= 0 or model.dof_M0[joint] < _LEAST_INERTIA:
             raise SceneError(
-                f"hand '{name}': link '{model.body(body).name}' has neither mass nor inertia; give "
+                f"hand '{name}': link '{model.body(body).name}' lacks mass or inertia; give "
                 "it an <inertial> or collision geometry"
             )
     contact = HandContact(scene)

@@ -57,14 +57,14 @@ class HandRequest:
     reset: Mapping[str, float] = field(default_factory=dict)
     """Reset position of joints, rad or m; other joints: zero, or the limit nearest to zero."""
     kp: float | None = None
-    """Gain of all finger servos, N m/rad; None: the file's, or 3."""
+    """Gain of the servos of wrist and fingers, N m/rad; None: the file's, or 3."""
     place: tuple[float, float, float] = models.WRIST_M
     """Position of the wrist with the base joints at zero, m, world frame."""
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Rotation about the world's x, then y, then z axis; at zero the fingers point along y and the
     palm faces down."""
     drop_tendons: bool = False
-    """Leave out tendons that actuators drive."""
+    """Leave out tendons that actuators drive; otherwise they are an error."""
     licence: str = "unstated"
     """Licence of the model, preferably as its SPDX identifier."""
     replace: bool = False
@@ -101,7 +101,8 @@ def author_hand(request: HandRequest, progress: StepProgress = silent) -> Author
         progress: receives the steps.
 
     Raises:
-        ConfigError: a value is wrong, a name is taken, or fingers cannot be distinguished.
+        ConfigError: a value is wrong, a name is taken, fingers cannot be distinguished, or joints,
+            actuators or constraints are not supported.
         CorruptAssetError: the file cannot be used; the message says why.
         SceneError: the resulting model does not compile or fails a check.
         LibraryError: the user's folder cannot be written.
@@ -175,7 +176,7 @@ def _check(request: HandRequest) -> None:
         if not low <= value <= high:
             raise ConfigError(f"--mount has {axis} = {value:g} m; valid: {low:g} to {high:g}")
     if not np.isfinite(request.turn_deg).all():
-        raise ConfigError(f"--turn is {request.turn_deg}; give three angles in degrees")
+        raise ConfigError(f"--turn is {request.turn_deg}; give three finite angles in degrees")
 
 
 def _settings(name: str, found: Anatomy) -> HandCfg:
@@ -246,7 +247,7 @@ def _mounted(
 
 
 def _other_side(label: str, xml: str, side: str) -> str | None:
-    """Return a note if the name of the file or model contains the other side."""
+    """Return a note if the names of file and model contain only the other side; None if not."""
     model = ET.fromstring(xml).get("model", "")
     other = "left" if side == "right" else "right"
     words = f"{label} {model}".lower()

@@ -11,7 +11,7 @@ from pgdm.errors import ConfigError
 from pgdm.library.couplings import Couplings
 
 KP = 3.0
-"""Gain of a servo if the file does not state it, N m/rad."""
+"""Gain of a servo if neither the file nor the user states it, N m/rad."""
 _DAMPING_S = 0.05  # damping of a joint that has none, as a share of its servo's gain
 _SINGLE = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 _OUT_RAD = 1e-3  # by how much a coupled joint may leave its range
@@ -38,18 +38,20 @@ def servos(
 ) -> tuple[dict[str, Servo], list[str]]:
     """Return the servo of each joint that follows no other, and what was changed.
 
-    A position actuator of the file keeps its gain and range; a joint with another actuator or none
-    gets a servo of gain ``kp``.
+    Only the first actuator of a joint counts. If it is a position actuator with gear 1, the servo
+    has its range, as far as the joint's allows, and its gain unless ``kp`` is given. Any other
+    joint gets a servo over the joint's range, of gain ``kp`` or :data:`KP`.
 
     Args:
         model: the hand as read.
         kp: gain of all servos, N m/rad; None: the file's, or :data:`KP`.
-        drop_tendons: whether to leave out actuators on tendons instead of raising an error.
+        drop_tendons: whether to leave out tendons with actuators instead of raising an error.
         label: the hand's file, for messages.
 
     Raises:
-        ConfigError: an actuator drives a tendon; a joint is neither hinge nor slide, or has no
-            range or a ``ref``; or there is an equality constraint that does not couple two joints.
+        ConfigError: an actuator drives a tendon, without ``drop_tendons``; a joint is neither hinge
+            nor slide, has no range, or has a ``ref``; an equality constraint does not couple two
+            joints; or a joint follows one that follows another.
     """
     couplings = Couplings(model, model.njnt)
     _check_equalities(model, couplings, label)
@@ -65,7 +67,7 @@ def servos(
                 )
             notes.append(f"tendon '{tendon}' and its actuator '{name}' were left out")
         elif kind != mujoco.mjtTrn.mjTRN_JOINT:
-            notes.append(f"actuator '{name}' drives no joint and was left out")
+            notes.append(f"actuator '{name}' does not drive a joint directly and was left out")
         else:
             driven.setdefault(int(model.actuator_trnid[actuator, 0]), []).append(actuator)
     for joint in range(model.njnt):
@@ -78,7 +80,9 @@ def servos(
             not model.jnt_limited[joint]
             or not model.jnt_range[joint, 0] < model.jnt_range[joint, 1]
         ):
-            raise ConfigError(f"{label}: joint '{name}' has no limits; give it a range")
+            raise ConfigError(
+                f"{label}: joint '{name}' has no limits or an empty range; give it a range"
+            )
         if model.qpos0[joint]:
             raise ConfigError(
                 f"{label}: joint '{name}' has ref {model.qpos0[joint]:g}; pgdm needs 0: subtract "
@@ -110,7 +114,8 @@ def _servo(
         else:
             name = model.joint(joint).name
             notes.append(
-                f"the actuator of '{name}' is not a position servo; a position servo replaces it"
+                f"the actuator of '{name}' is not a position servo with gear 1; such a one "
+                "replaces it"
             )
     given = gain is not None and kp is None
     gain = gain if given and gain is not None else (KP if kp is None else kp)
@@ -131,13 +136,19 @@ def _check_equalities(model: mujoco.MjModel, couplings: Couplings, label: str) -
         if leader in couplings.followers:
             raise ConfigError(
                 f"{label}: joint '{model.joint(int(follower)).name}' follows "
-                f"'{model.joint(int(leader)).name}', which follows another; make both follow the "
-                "latter"
+                f"'{model.joint(int(leader)).name}', which itself follows another joint; make "
+                "both follow that joint"
             )
 
 
 def narrowed(model: mujoco.MjModel) -> tuple[dict[str, tuple[float, float]], list[str]]:
-    """Return narrower ranges for joints that would take a coupled joint beyond its own range."""
+    """Return narrower ranges for joints that would take a coupled joint beyond its own range.
+
+    Also returns a note on each.
+
+    Raises:
+        ConfigError: no position of a joint keeps those that follow it within their ranges.
+    """
     couplings, found, notes = Couplings(model, model.njnt), {}, []
     for leader in dict.fromkeys(couplings.leaders.tolist()):
         mine = couplings.leaders == leader
@@ -150,7 +161,7 @@ def narrowed(model: mujoco.MjModel) -> tuple[dict[str, tuple[float, float]], lis
         if not inside.any():
             raise ConfigError(
                 f"joint '{name}' has no position at which the joints that follow it are within "
-                "their ranges; correct <mimic>, or the ranges"
+                "their ranges; correct the coupling (<mimic> in URDF), or the ranges"
             )
         if inside.all():
             continue

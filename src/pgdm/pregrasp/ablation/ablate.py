@@ -89,7 +89,7 @@ class Ablated:
     object_moved_m: float
     """How far the fingers pushed the object in simulation; in the start it is back in place."""
     simulated: bool
-    """Whether the fingers can move there in simulation; else the pose is only set kinematically."""
+    """Whether a simulation has moved the fingers there; else the pose is only set kinematically."""
     depth_m: float
     """Deepest penetration between the hand and anything else."""
 
@@ -134,10 +134,12 @@ def ablate(cfg: AblationCfg, start: StartState, scene: Scene, substeps: int) -> 
     moves by ``cfg.distance_m`` along the straight line towards its reset position, if need be past
     it, up to the limit of a slide. If the hand then penetrates something, deeper than in the stored
     start or than :data:`OVERLAP_M`, one of two compromises is made, whichever deviates less: the
-    hand retreats further, back, up or away from the object; or each finger stops at the first
-    contact on its way from the pre-grasp. This motion is then checked in simulation, where it must
-    not push the object (unless the stored start already penetrates deeply). Equal arguments give an
-    equal result.
+    hand retreats further, back, up or away from the object; or, if the ablation changes the finger
+    pose, each finger stops at the first contact on its way from the pre-grasp, perhaps also with a
+    retreat. The second is checked in simulation: the fingers must come near their pose without
+    pushing the object. If the three best such poses fail, the hand retreats instead. There is no
+    simulation if the stored start already penetrates deeply. Equal arguments give an equal result.
+    An ablation that removes nothing returns the stored start.
 
     Args:
         cfg: the ablation.
@@ -148,7 +150,7 @@ def ablate(cfg: AblationCfg, start: StartState, scene: Scene, substeps: int) -> 
     Raises:
         ConfigError: a setting is wrong, the start is the reset pose, or ``hand.mean_fingers_rad``
             has a wrong length.
-        SceneError: no pose free of penetration exists within the slides' limits.
+        SceneError: the hand still penetrates something after any retreat within the slides' limits.
     """
     cfg.check(start.source)
     if cfg.changes_start and is_reset_pose(scene, start.qpos):
@@ -213,7 +215,7 @@ class _Ablation:
                     return self.found(qpos, float(retreat))
         raise SceneError(
             f"task '{self._scene.task.id}', ablation '{self._cfg.name}': the hand penetrates "
-            "something wherever its slides can take it"
+            "something however far it retreats back, up or away from the object"
         )
 
     def stopped(self, limit: float) -> list[Ablated]:
@@ -286,7 +288,7 @@ class _Ablation:
         return self._scene.index.couplings.apply(qpos)
 
     def _room(self, slides: np.ndarray, direction: np.ndarray) -> float:
-        """Return how far the slides can move from (3,) along a unit vector (3,), m."""
+        """Return how far the slides can move from a position (3,) along a unit vector (3,), m."""
         low, high = self._scene.model.jnt_range[:3].T
         moving = np.abs(direction) > 1e-9
         ends = (np.where(direction > 0, high, low) - slides)[moving] / direction[moving]

@@ -1,4 +1,4 @@
-"""Restricts the labeler's server to its own page, opened on this machine.
+"""Keeps other machines, and pages of other sites, away from the labeler's server.
 
 This is the only module that uses viser's private interface, which may change with any version.
 """
@@ -35,7 +35,7 @@ def quietly() -> Iterator[None]:
 
 
 def open_server(port: int) -> viser.ViserServer:
-    """Start a server that only its own page on this machine can use.
+    """Start a server on this machine that refuses pages of other sites.
 
     Args:
         port: port to listen on; if it is taken, viser uses the next free one.
@@ -82,8 +82,9 @@ def secure(server: viser.ViserServer) -> None:
     allowed = {f"http://{name}:{server.get_port()}" for name in (HOST, "localhost")}
 
     async def check(connection: WebsockClientConnection) -> None:
-        # Browsers always send the page's origin, which the page cannot change; other programs send
-        # no origin. If the connection is not found, the KeyError makes viser close it.
+        # Browsers always send the page's origin, which the page cannot change; other programs on
+        # this machine send none and may connect. If the connection is not found, the KeyError makes
+        # viser close it.
         socket = connections[connection.client_id]
         origin = socket.request.headers.get("Origin")
         if origin is not None and origin not in allowed:

@@ -33,9 +33,9 @@ class Metrics:
     """Contacts and distances of a pose."""
 
     touches: tuple[Touch, ...]
-    """The deepest penetration of each part into each object, deepest first."""
+    """The deepest penetration of each part into each object, deepest first; only above 0.1 mm."""
     links: frozenset[int]
-    """Ids of the hand's bodies that penetrate something."""
+    """Ids of the hand's bodies that penetrate something by more than 0.1 mm."""
     tip_distances_m: np.ndarray
     """Distance from the surface of each finger's last link to the object's, (F,); negative if it
     penetrates."""
@@ -49,7 +49,7 @@ class Metrics:
 
     @property
     def depth_m(self) -> float:
-        """Deepest penetration, 0 if there is none."""
+        """Deepest penetration; 0 if none exceeds 0.1 mm."""
         return self.touches[0].depth_m if self.touches else 0.0
 
     @property
@@ -63,7 +63,7 @@ class Meter:
     """Measures poses of one scene.
 
     Args:
-        scene: a scene; the hand's actuated joints are first in qpos.
+        scene: a scene; the hand's n joints are first in qpos.
         kinematics: kinematics of the same scene.
     """
 

@@ -17,7 +17,7 @@ from pgdm.pregrasp.labeler.state import LabelState
 from pgdm.sim.contact import FAR_M
 
 PAUSE_S = 1.0
-"""Moving a slider after a pause longer than this starts a new step of the undo history."""
+"""Moving the same slider again after a longer pause starts a new step of the undo history."""
 _ORDER = (WRIST, "Index", "Middle", "Ring", "Little", "Thumb")
 _STEP = 0.1  # of the sliders, mm and degrees
 GREEN, _RED, _AMBER = "#2f9e44", "#e03131", "#e8890c"
@@ -37,7 +37,7 @@ class Commands:
     try_it: Callable[[], None]
     cancel: Callable[[], None]
     save: Callable[[bool], None]
-    """Called with whether to save anyway: if the hand touches something or a pose is replaced."""
+    """Called with whether to save even if the hand touches something or an earlier pose is lost."""
     handles: Callable[[str], None]
     solid: Callable[[bool], None]
 

@@ -30,7 +30,8 @@ PRESETS = ("mined", "planned", "learned", "mocap", "teleop", "labeled", "mean", 
 DEFAULTS = ("labeled", "planned", "mined", "mocap", "none")
 """By default the labeler starts from the first of these that exists."""
 AUTOSAVE_S = 1.0
-"""Interval at which the draft is saved: if the labeler is killed, at most this much is lost."""
+"""Interval at which the draft is saved: if the labeler is killed, at most the
+changes of this time are lost."""
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,7 @@ class Stage:
     def _lights(self) -> None:
         scene = self._scene_api
         scene.configure_environment_map("studio", environment_intensity=0.25)
-        # viser's shadows are made for whole rooms: at the size of a hand, only their cost shows.
+        # viser's shadows are made for whole rooms: at a hand's size they are invisible, but slow.
         scene.configure_default_lights(cast_shadow=False)
         scene.world_axes.visible = False
 

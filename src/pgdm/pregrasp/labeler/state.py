@@ -83,7 +83,9 @@ class LabelState:
     def place_wrist(self, pos: np.ndarray, quat: np.ndarray, gesture: object = None) -> None:
         """Bring the wrist to (3,) m and the mount body to (4,) wxyz, world frame, within limits."""
         if not (np.isfinite(pos).all() and np.isfinite(quat).all() and np.linalg.norm(quat) > 0.1):
-            raise ConfigError(f"the wrist cannot go to {pos}, {quat}: not a finite pose")
+            raise ConfigError(
+                f"the wrist cannot go to {pos}, {quat}: not a finite pose with a nonzero quaternion"
+            )
         self.set_joints(self.kinematics.place_wrist(self._qpos, pos, quat), gesture)
 
     def place_tip(self, finger: int, target: np.ndarray, gesture: object = None) -> float:
@@ -144,6 +146,8 @@ class LabelState:
         wrong = np.flatnonzero(~np.isfinite(joints))
         if wrong.size:
             joint = self.joints[int(wrong[0])]
-            raise ConfigError(f"joint '{joint.name}' ({joint.full}) is {joints[wrong[0]]}")
+            raise ConfigError(
+                f"joint '{joint.name}' ({joint.full}) is {joints[wrong[0]]}; it must be finite"
+            )
         inside = joints.clip(self.kinematics.low, self.kinematics.high)
         return self.scene.index.couplings.apply(inside)

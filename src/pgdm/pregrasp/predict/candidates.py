@@ -56,7 +56,8 @@ def propose(
         At most ``count`` candidates, most promising first, as yet without a lift rate.
 
     Raises:
-        ConfigError: the predictor is for another hand, or the object is attached to something.
+        ConfigError: the predictor is for another hand, or for a version of the hand with other
+            joints, or the object is attached to something.
         SceneError: no sample could be freed.
     """
     if predictor.hand != scene.hand.name:

@@ -21,12 +21,12 @@ from pgdm.sim.scene import Scene
 
 BASIS_POINTS = 256
 BASIS_RADIUS_M = 0.15
-"""Radius of the ball of basis points: how far a hand reaches around an object's centre. The same
-for all objects, because the hand's size is."""
+"""Radius of the ball of basis points: how far a hand reaches around an object's centre. It is
+the same for all objects, since only the hand's size matters."""
 SURFACE_POINTS = 6000
 
 _INSIDE_M = 1e-4  # a point deeper than this in another part is not on the object's surface
-_LEAST_POINTS = 20  # sampled on each part
+_LEAST_POINTS = 20  # least number sampled on each part
 
 
 @lru_cache(maxsize=1)
@@ -57,7 +57,7 @@ def object_code(scene: Scene, qpos: np.ndarray) -> np.ndarray:
     """Return the code (B,) of a scene's tracked object in its pose at qpos (nq,).
 
     Raises:
-        SceneError: the object has no collision geometry.
+        SceneError: the object has no collision geometry, or a geom without a closed surface.
     """
     data = posed(scene, qpos)
     points = surface_points(scene.model, data, scene.index.object_body)

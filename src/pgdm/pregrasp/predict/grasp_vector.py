@@ -57,7 +57,10 @@ class GraspFrame:
         return 9 + self._n - self._base
 
     def vector(self, qpos: np.ndarray) -> np.ndarray:
-        """Return the grasp vector (9+J,) of a state qpos (nq,), joints clipped to their limits."""
+        """Return the grasp vector (9+J,) of a state qpos (nq,).
+
+        Its joints are clipped to their limits; its position and rotation are those of the state.
+        """
         data = self._at(qpos)
         palm = data.xmat[self._palm].reshape(3, 3)
         centre = data.xipos[self.scene.index.object_body]

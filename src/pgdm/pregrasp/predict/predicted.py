@@ -18,7 +18,7 @@ from pgdm.pregrasp.reach.planner import plan_reach
 from pgdm.pregrasp.sources import reset_state
 from pgdm.sim.scene import Scene
 
-_TRIES = 3  # most candidates to plan a reach for; if all plans fail, the best one is used anyway
+_TRIES = 3  # most candidates to plan a reach for; if all plans fail, the best candidate is used
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class PredictCfg:
     """Settings of a prediction."""
 
     samples: int = 8
-    """Number of candidates that are lift-tested."""
+    """Largest number of candidates that are lift-tested."""
     seed: int = 0
-    """Seed of samples, lift test and reach plan."""
+    """Seed of samples, of the search that frees them, of lift test and reach plan."""
     reach: bool = True
     """Whether to plan the reach."""
 
@@ -42,9 +42,9 @@ class Predicted:
     chosen: int
     """Index of the chosen candidate."""
     plan: ReachPlan | None
-    """Reach plan that ends at the chosen candidate; None if no plan succeeded."""
+    """Reach plan that ends at the chosen candidate; None if no plan succeeded or was asked for."""
     pregrasp: Pregrasp
-    """The chosen candidate, with the final state of its plan and a note on its origin."""
+    """The chosen candidate, with the final state of its plan, if any, and a note on its origin."""
 
 
 def predict(
@@ -70,7 +70,8 @@ def predict(
     Raises:
         ConfigError: the predictor is for another hand, the object is attached to something, or
             the motion does not store where objects start.
-        SceneError: no candidate can be freed from contact, or every planned reach diverges.
+        SceneError: no candidate can be freed from contact, the object's shape cannot be encoded, or
+            all simulations of a candidate's reach diverge.
     """
     held_out = _is_held_out(predictor, scene, notify)
     objects = reset_state(motion, scene)

@@ -9,6 +9,8 @@ codes and vectors minus these means, W is the ridge regression
 
     W = X^T (X X^T + penalty var(X) I)^-1 Y
 
+with var(X) the total variance of the codes, taken as at least 0.5.
+
 Each object is held out in turn: the penalty is chosen for the least fingertip error on the held-out
 objects, and S is 0.7^2 times the second moment of the vectors' errors there. With some 40
 pre-grasps this predicts better than networks trained by gradient descent
@@ -35,7 +37,7 @@ PENALTIES = (0.3, 1.0, 3.0, 10.0, 30.0)
 SPREAD = 0.7
 """Standard deviation of the samples relative to that of the held-out errors. Less than 1, because
 among few candidates those far from the mean are rarely the best: the fingertip error of the best of
-8 is 36 mm, and 38 mm with 1."""
+8 candidates is 36 mm with this value, and 38 mm with 1."""
 LEAST_OBJECTS = 2
 _LEAST_VARIANCE = 0.5
 """Lower bound of the codes' total variance in the ridge penalty. The variance of 32 objects is 3.4,

@@ -60,7 +60,10 @@ class ReachPlan:
 
     @property
     def reached(self) -> bool:
-        """Whether the hand reaches the target without moving the object or penetrating anything."""
+        """Whether the hand reaches the target without moving the object or penetrating anything.
+
+        Each of these holds within its tolerance; penetration may be as deep as at the target.
+        """
         return not self.failures
 
     @property

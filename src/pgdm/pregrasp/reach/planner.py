@@ -5,7 +5,7 @@ plan uses only the final state and the object's largest displacement on the way:
 
     cost = sum_i e_i + sqrt(mean_j r_j^2) + peak / 5 mm + 0.05 s mean_j |qdot_j| / tol_j
 
-with e_i the errors of :meth:`pgdm.pregrasp.reach.plan.Goal.shares`, each divided by its tolerance,
+with e_i the shares of :meth:`pgdm.pregrasp.reach.plan.Goal.shares` (errors divided by tolerances),
 r_j the error of joint j divided by its tolerance tol_j, qdot_j its final velocity, and peak the
 object's largest displacement. After each round the mean of the final targets is also shifted by a
 share of the remaining error, because servos do not fully reach their targets.
@@ -34,7 +34,7 @@ servo lag, s, above which a base counts as slow."""
 
 _END_STD = 0.003, 0.02, 0.03
 """First standard deviation of final targets: slides m, hinges rad, joints after the base rad."""
-_END_LIMIT = 5.0  # largest distance of the final targets from the goal, in tolerances
+_END_LIMIT = 5.0  # largest distance of the mean final targets from the goal, in tolerances
 _SETTLE_GAIN = 0.6  # of the integrator that finds the servos' steady-state offsets without contact
 _SHIFT = 0.7  # largest shift of the goal where servos cannot remove an error, in tolerances
 _SLACK = 0.4  # error that is not corrected, in tolerances
@@ -58,7 +58,8 @@ class ReachCfg:
     correction: float
     """Share of the elites' remaining error that a round adds to the final targets (0..1)."""
     margin: float
-    """The search stops once every error is below this share of its tolerance (0..1)."""
+    """The search stops once penetration and every error, except the object's rotation, are at most
+    this share of their tolerances (0..1)."""
     patience: int
     """The search also stops after this many rounds without improvement, if the pre-grasp is
     reached."""
@@ -138,7 +139,7 @@ class _Candidate:
     vector: np.ndarray  # (D,)
     plan: ReachPlan
     cost: float
-    worst: float  # largest error, in tolerances
+    worst: float  # largest error or penetration, in tolerances; without the object's rotation
 
     def beats(self, other: _Candidate | None, margin: float) -> bool:
         """Return whether this candidate is better than another, or there is no other.
@@ -180,7 +181,7 @@ class _Search:
         aim, extra = self._rollouts.settled(above, nearest, farthest, _SETTLE_GAIN)
         shift, limit = (aim - above)[base:], _END_LIMIT * tolerance
         mean[self._paths.layout.ends][base:] = shift + extra.clip(-limit, limit)[base:]
-        # Where the goal was shifted, errors up to that shift are not corrected again.
+        # Where the goal was shifted, errors up to the largest shift are not corrected again.
         self._slack = nearest
         self._slack[base:] = np.where(shift != 0, farthest[base:], nearest[base:])
         self._cem = CrossEntropy(mean, std, cfg.cem, seeding.numpy_stream(seed, "reach"))

@@ -13,7 +13,10 @@ from pgdm.sim.scene import Scene, SceneIndex
 
 @dataclass(frozen=True)
 class Ends:
-    """Final states of N plans; the object's are relative to its motion if the hand stays away."""
+    """Final states of N plans.
+
+    The object's displacement and rotation are relative to its pose if the hand stays away.
+    """
 
     qpos: np.ndarray  # (N, nq) m, rad
     qvel: np.ndarray  # (N, nv) m/s, rad/s

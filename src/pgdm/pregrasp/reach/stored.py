@@ -27,7 +27,8 @@ def pose_of(source: str, motion: Motion, scene: Scene) -> np.ndarray:
     The user's own pre-grasp takes precedence over the one stored with the motion.
 
     Raises:
-        ConfigError: no pre-grasp of this source is stored for the task and hand.
+        ConfigError: no pre-grasp of this source is stored for the task and hand, or it is only the
+            reset pose.
     """
     task, hand, nq = scene.task.id, scene.hand.name, scene.model.nq
     own = pregrasp_file.find(task, hand, source) if source in pregrasp_file.SOURCES else None
@@ -65,7 +66,8 @@ def store(
     """Store a reach plan in the user's folder, and return the path of the file.
 
     A plan to the mined pre-grasp is stored as the user's ``planned`` pre-grasp; a plan to one of
-    the user's own pre-grasps is added to the file of that pre-grasp.
+    the user's own pre-grasps is added to the file of that pre-grasp. A plan to any other pre-grasp
+    is stored with it in a new file, as the user's own pre-grasp of that source.
 
     Args:
         scene: scene of the task.

@@ -1,8 +1,10 @@
 """Inverse kinematics: poses a scene's hand like a human hand, free of penetration if possible.
 
-Differential inverse kinematics (:class:`pgdm.pregrasp.retarget.hand_ik.HandIk`) is tried in two
-ways: directly to the targets, then freed from penetration; and from a distance with open fingers,
-avoiding object and table. The result of least cost is used.
+Differential inverse kinematics (:class:`pgdm.pregrasp.retarget.hand_ik.HandIk`) is tried in three
+ways: directly to the targets; by way of poses with the fingertips farther apart and the palm
+farther back; and from a distance with open fingers, avoiding object and table. If the direct result
+penetrates something, it and the best of the others are freed from penetration, and the result of
+least cost is used.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ _SPAN_M = 0.05
 _FLAT_M = 0.003
 """Measurement tolerance: how far the thumb of a right hand may lie behind the plane of the palm."""
 _WORLD_M = 1e6
-"""Larger coordinates are refused, whatever their unit."""
+"""Coordinates of this size or larger are refused, whatever their unit."""
 _MM, _CM = 1e-3, 1e-2
 
 
@@ -62,9 +62,9 @@ class Keypoints:
             label: name of the points in error messages.
 
         Raises:
-            ConfigError: the number of points is wrong, a coordinate is not finite or 1e6 or
-                more, bone lengths are impossible (perhaps in another unit than metres), or the
-                hand is a left one.
+            ConfigError: the number of points is wrong, the order is unknown or does not fit that
+                number, a coordinate is not finite or its size is 1e6 or more, bone lengths are
+                impossible (perhaps in another unit than metres), or the hand is a left one.
         """
         points = np.asarray(points, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or len(points) not in (16, 21):
@@ -77,7 +77,7 @@ class Keypoints:
             row, axis = wrong[0]
             raise ConfigError(
                 f"{label}: point {row} has {'xyz'[axis]} = {points[row, axis]}; coordinates must "
-                f"be finite and below {_WORLD_M:g}"
+                f"be finite, and below {_WORLD_M:g} in size"
             )
         order = order or ("mano" if len(points) == 16 else "openpose")
         check_name(f"{label}: order of points", order, ORDERS)

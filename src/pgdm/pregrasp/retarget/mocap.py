@@ -55,14 +55,14 @@ class Retargeted:
 
     @property
     def unreachable(self) -> list[str]:
-        """What the hand cannot reach, in words; empty if it reaches everything."""
+        """What is wrong, in words: fingertips out of reach, slides at a limit, or penetration."""
         errors = self.result.fingertip_errors_m
         found = [
             f"{self.fingers[i]} fingertip ends {1e3 * errors[i]:.0f} mm from its target"
             for i in self.result.unreached
             if i in self.measured
         ]
-        # The names of the base's slides start with ART in all hands.
+        # The names of the base's slides start with ART in all of the benchmark's hands.
         slides = [n for n in self.result.at_limit if n.rpartition("/")[2].startswith("ART")]
         if slides:
             found.append(f"the base is at the end of {', '.join(slides)}")
@@ -170,13 +170,16 @@ def retarget(
         library: library with the object.
         motion: motion of the task.
         recording: recording of the human hand.
-        frame: index of the frame to follow; by default ``recording.chosen`` (the first frame for
-            the library's recordings, like the mined pre-grasps), else the last before contact.
+        frame: index of the frame to follow; by default ``recording.chosen`` (for the library's
+            recordings the first, as in the mined pre-grasps), else the last before contact.
         seed: seed of the search that frees the hand.
 
     Raises:
         ConfigError: there is no such frame, the hand's points do not have the layout that inverse
-            kinematics needs, or the recording has poses of an object attached to something.
+            kinematics needs, the object is attached to something and the recording has its poses,
+            or several frames of which none is chosen, or the recorded quaternions seem to be in the
+            order x y z w.
+        CorruptAssetError: the object has no parts to touch.
     """
     objects = object_joints(motion, scene)
     recording = _placed(recording, scene, objects)

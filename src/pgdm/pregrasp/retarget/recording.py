@@ -66,7 +66,8 @@ def read(path: Path) -> Recording:
     Raises:
         ConfigError: the extension or a key is unknown, or the joints are not a right hand in
             metres.
-        CorruptAssetError: the file is missing, damaged, or lacks an array.
+        CorruptAssetError: the file is missing or damaged, or an array is missing or has wrong
+            contents.
     """
     readers = {".npz": safe_npz.read_npz, ".json": _read_json, ".csv": _read_csv}
     ending = path.suffix.lower()
@@ -88,8 +89,11 @@ def parse(arrays: Mapping[str, Any], label: str) -> Recording:
         label: name of the file, for messages.
 
     Raises:
-        ConfigError: the joints are not a right hand in metres, or an order is unknown.
-        CorruptAssetError: an array is missing, has a wrong shape or contains NaN.
+        ConfigError: the joints are not a right hand in metres, a coordinate of them is not finite,
+            or an order is unknown.
+        CorruptAssetError: an array is missing, is not numeric or has a wrong shape, only one of the
+            object's position and orientation is given, or these are not finite or no unit
+            quaternions.
     """
     if "joints" not in arrays:
         raise CorruptAssetError(f"{label}: lacks 'joints'; it has {', '.join(sorted(arrays))}")
@@ -97,7 +101,8 @@ def parse(arrays: Mapping[str, Any], label: str) -> Recording:
     joints = joints[None] if joints.ndim == 2 else joints
     if joints.ndim != 3 or not 1 <= len(joints) <= MAX_FRAMES:
         raise CorruptAssetError(
-            f"{label}: 'joints' has shape {joints.shape}; expected (frames, 16 or 21, 3)"
+            f"{label}: 'joints' has shape {joints.shape}; expected (frames, 16 or 21, 3), "
+            "with 1 to 100,000 frames"
         )
     order = arrays.get("order")
     if isinstance(order, np.ndarray) and order.ndim == 0:
@@ -192,7 +197,10 @@ def _table(points: dict[tuple[int, int], list[float]], path: Path) -> np.ndarray
     if joints not in (16, 21):
         raise ConfigError(f"{path}: joints go up to {joints - 1}; a hand has 0 to 15, or 0 to 20")
     if len(points) < joints or not 0 < frames <= MAX_FRAMES:
-        raise CorruptAssetError(f"{path}: {len(points)} rows for {frames} frames")
+        raise CorruptAssetError(
+            f"{path}: {len(points)} rows for {frames} frames; expected "
+            "a row for each joint in each of 1 to 100,000 frames, numbered from 0"
+        )
     for frame in range(frames):
         for joint in range(joints):
             if (frame, joint) not in points:

@@ -21,7 +21,8 @@ ANCHORS = ("wrist", "pads")
 or the fingers' pads, for robot hands of another size."""
 
 LIKE_A_PERSON = 0.8, 1.35
-"""Range of the robot hand's length relative to the human hand's in which they count as equal."""
+"""Range of the robot hand's length relative to the human hand's in which they count as about
+equal."""
 
 _WEIGHTS = {"wrist": (0.6, 0.6, 0.6, 1.0), "pads": (0.05, 0.05, 0.1, 1.0)}
 """Weights of wrist, knuckles, middle points and distal points (the fingertips), 1/m, by anchor."""
@@ -81,7 +82,8 @@ class HandShape:
         self.lengths = np.linalg.norm(
             np.diff(np.insert(rest[self.rows], 0, rest[0], axis=1), axis=1), axis=-1
         )
-        """Lengths (F, 3) m of the bones from wrist to knuckle, middle point and distal point."""
+        """Lengths (F, 3) m of each finger's bones: wrist to knuckle, knuckle to middle point,
+        middle to distal point."""
         axes = palm_axes(rest[0], rest[self.rows[self._across, 0]])
         self.palm_in_body = rotation.T @ axes
         """The palm's axes in the frame of the palm's body (3, 3)."""

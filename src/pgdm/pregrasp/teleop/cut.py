@@ -22,7 +22,7 @@ from pgdm.sim.scene import Scene
 LASTING_STEPS = 5
 """The hand takes hold if a contact lasts at least this many control steps (0.2 s)."""
 FITS_M = 0.01
-"""If the palm misses its observed position by more, the demonstration is of another hand."""
+"""If the palm misses its observed position by more, the demonstration counts as another hand's."""
 BEYOND_M = 0.02
 """Largest distance by which a demonstration may exceed the slides' ranges."""
 
@@ -71,7 +71,8 @@ class Replay:
     shift_m: float
     """Distance between the object's positions in the demonstration and in the task."""
     beyond_m: float
-    """How far the slides would have to exceed their ranges in the step before the hold."""
+    """How far the slides would have to exceed their ranges in the step before the hold; without a
+    hold, in the last step."""
     palm_error_m: float
     """Largest distance of the palm from its observed position along the first two slides, which the
     demonstrations' hand does not have."""
@@ -181,13 +182,15 @@ def cut(scene: Scene, made: Replay, objects: np.ndarray, origin: str) -> Pregras
         origin: the demonstration's file, for messages.
 
     Raises:
-        ConfigError: the hand never takes hold, does so in the first step, or would have to exceed
-            its slides' ranges.
+        ConfigError: the hand never takes hold, does so in the first step, would have to exceed its
+            slides' ranges, or is inside something in every step before the hold.
     """
     label = f"demonstration {made.number} of {origin}"
     hold = made.hold
     if hold is None:
-        raise ConfigError(f"{label}: the hand never touches anything for {LASTING_STEPS} steps")
+        raise ConfigError(
+            f"{label}: the hand never touches anything for {LASTING_STEPS} steps in a row"
+        )
     if hold == 0:
         raise ConfigError(f"{label}: the hand already holds something in the first step")
     if made.beyond_m > BEYOND_M:

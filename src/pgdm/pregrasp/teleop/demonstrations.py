@@ -40,7 +40,8 @@ def read(path: Path) -> list[Demonstration]:
     """Read all demonstrations of a file.
 
     Args:
-        path: a DAPG ``.pickle``, a Minari ``.hdf5``, or the folder of a Minari dataset.
+        path: a DAPG ``.pickle`` (or ``.pkl``), a Minari ``.hdf5`` (or ``.h5``), or the folder of a
+            Minari dataset.
 
     Raises:
         UnknownNameError: the extension is unknown.
