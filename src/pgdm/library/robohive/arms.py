@@ -88,7 +88,7 @@ def _rebuild(link: ET.Element, number: int) -> None:
     joint = link.find("joint")
     if (joint is None) != (number == 0):
         raise CorruptAssetError(
-            f"franka_sim: body {number} of its chain: body 0 must have no joint, the others one each"
+            f"franka_sim: body {number} of its chain: body 0 must have no joint, all others one"
         )
     if joint is not None:
         joint.attrib = {"name": f"joint{number}", "range": JOINT_RANGES_RAD[number - 1]}
