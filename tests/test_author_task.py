@@ -79,7 +79,9 @@ def test_keyframes_become_a_task_that_runs(brick: str) -> None:
     assert "own" in command("pgdm", "assets", "list").out
     shown = command("pgdm", "assets", "show", "brick-lift")
     assert shown.code == 0 and "source own (serves the task)" in shown.out, shown.err
-    with pytest.raises(LibraryError, match="object 'brick' is used by brick-lift; remove it first"):
+    with pytest.raises(
+        LibraryError, match="object 'brick' is used by brick-lift; remove that task first"
+    ):
         own.remove("brick")
     # The user's pre-grasps are for one motion: with another they are set aside.
     kept = pregrasp_file.path_of("brick-lift", "dmanus", "labeled")

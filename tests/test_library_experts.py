@@ -319,7 +319,7 @@ def test_its_quality_is_shown(root: Path) -> None:
     for words in (
         "(published): robohive 0.4.0, SHA-256 00",
         "Apache-2.0  from tmp_data/Adroit_hammer_use_1.npz",
-        "poses: 6, after 14 frames of the recording",
+        "poses: 6, after 14 skipped frames of the recording",
         "the motion's by 1.200 mm (mean), 3.400 mm (max), after a shift by (0.0, -10.1, 0.0)",
         "limits by up to 0.86 rad and, at the base, 0.26 m",
         "touches the object at 5 poses; by finger",

@@ -254,7 +254,7 @@ def test_the_error_without_pip_names_the_remedies(
     bare.write_text('#!/bin/sh\necho "python: No module named pip" >&2\nexit 1\n')
     bare.chmod(0o755)
     monkeypatch.setattr(package_index.sys, "executable", str(bare))
-    with pytest.raises(LibraryError, match=r"needs pip, .*ensurepip.*downloads folder yourself"):
+    with pytest.raises(LibraryError, match=r"needs pip, .*ensurepip.*PGDM_HOME/downloads yourself"):
         package_index.fetch(package, tmp_path, False, silent)
 
 

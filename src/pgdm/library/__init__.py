@@ -28,7 +28,8 @@ __all__ = [
     "open_library",
 ]
 
-# Filling the library needs MuJoCo and SciPy, which take a second to import; reading it does not.
+# Filling the library needs MuJoCo and SciPy, which take a second to import. Reading it needs
+# neither.
 _LATE = {
     "ImportSummary": "builder",
     "ensure": "provide",

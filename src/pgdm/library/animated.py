@@ -58,7 +58,8 @@ def read(task: str) -> AnimatedTask:
     """Read a task's file.
 
     Raises:
-        CorruptAssetError: the installation is damaged.
+        CorruptAssetError: the file is missing or damaged.
+        ConfigError: its keyframes are wrong.
     """
 
     path = FOLDER / f"{task}.yaml"
@@ -98,7 +99,8 @@ def fill(root: Path, library: Library) -> None:
 
     Raises:
         UnknownNameError: the library lacks an object.
-        CorruptAssetError: a file is damaged.
+        LibraryError: the library has neither ``checkout`` nor ``registry``.
+        CorruptAssetError: an object or a file of keyframes is damaged.
     """
     files: dict[str, FileEntry] = {}
     tasks: dict[str, TaskEntry] = {}

@@ -33,13 +33,14 @@ def ensure_panda(
 
     Args:
         offline: never download; an earlier download is used.
-        notify: receives one line if something is fetched.
+        notify: receives one line if the library lacks the arm, which is then read from the package.
         root: the library, by default the one under ``PGDM_HOME``.
         progress: receives the progress of a fetch; by default ``notify`` does, every few seconds.
 
     Raises:
-        LibraryError: the model is missing and cannot be fetched.
-        CorruptAssetError: a file of the package is damaged.
+        LibraryError: the model is missing and cannot be fetched, or another process has just
+            changed it.
+        CorruptAssetError: a file of the package or the manifest of the folder ``arms`` is damaged.
     """
     root = paths.library() if root is None else root
     if (present := _intact(root)) is not None:
@@ -60,7 +61,7 @@ def ensure_panda(
 
 
 def _intact(root: Path) -> Path | None:
-    """Return the arm's MJCF file, or None unless all its files have the recorded hashes."""
+    """Return the arm's MJCF file, or None unless all the arm's files have their recorded hashes."""
     folder = staging.folder_of(root, ARMS)
     if folder is None:
         return None

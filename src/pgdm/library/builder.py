@@ -109,7 +109,9 @@ class SourceBuilder:
         Call :meth:`compile_models` first.
 
         Raises:
-            CorruptAssetError: an array is damaged or does not fit the scene.
+            CorruptAssetError: an array is damaged or does not fit the scene, or ``origin`` is a
+                link that leads out of ``root``.
+            ConfigError: the task's id is not valid.
         """
         label = model_file.name_in(origin, self._root)
         model_file.check_stays(origin, self._root)
@@ -147,7 +149,7 @@ class SourceBuilder:
         self._record(path, origin)
 
     def has(self, kind: str, name: str) -> bool:
-        """Return whether a hand or object was added."""
+        """Return whether a model of this kind and name was added."""
         return f"{kind}/{name}" in self._models
 
     def lacking(self, task: str) -> list[str]:

@@ -42,7 +42,9 @@ class Library:
     come from ``checkout`` or ``registry``, by precedence. Each motion is read once: its arrays are
     shared, so copy them before changing any.
 
-    Methods that return an asset raise LibraryError if the library is empty or the file is missing.
+    Methods that look up a task, model or motion raise LibraryError if the library is empty. If they
+    return a file or its content, they also raise it if the file is missing, and CorruptAssetError
+    if the file has changed since it was recorded.
 
     Args:
         root: the library's folder.
@@ -243,7 +245,7 @@ class Library:
         """Return the MJCF file of the table scene.
 
         Raises:
-            LibraryError: the library is empty.
+            LibraryError: the library has neither ``checkout`` nor ``registry``.
         """
         have = {s: ["table"] for s in self._whole()}
         return self._model("scene", "table", source, have, "scene/table.xml")
@@ -291,7 +293,7 @@ class Library:
         return path
 
     def _check_unchanged(self, source: str, relative: str) -> None:
-        """Check a file's hash, and those of a model's meshes, against the manifest; only once."""
+        """Check a file's hash against the manifest, once; of a model, all files in its folder."""
         if (source, relative) in self._unchanged:
             return
         model = f"{relative.rpartition('/')[0]}/" if relative.endswith(".xml") else relative

@@ -53,10 +53,10 @@ def free_by_search(
     away: Callable[[np.ndarray], float] = lambda qpos: 0.0,
     seed: int = 0,
 ) -> tuple[np.ndarray, bool]:
-    """Return the state near ``qpos`` with the least penetration, and whether it has none.
+    """Return the state near ``qpos`` with the least penetration, and whether that is negligible.
 
     A cross-entropy search over offsets z of the hand's joint positions h, in units of the first
-    standard deviations s:
+    standard deviations s; coupled joints then follow their leaders:
 
         h(z) = clip(h_0 + s z)        cost(z) = away + depth_weight * depth + move_weight * |z|^2/n
 

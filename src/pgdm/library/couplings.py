@@ -7,7 +7,7 @@ import numpy as np
 
 
 class Couplings:
-    """The coupled joints among the first joints of a model.
+    """The C coupled joints among the first joints of a model.
 
     The position of a follower depends on its leader's: q_f = a_0 + a_1 q_l + ... + a_4 q_l^4.
 

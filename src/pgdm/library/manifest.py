@@ -37,9 +37,10 @@ class FileEntry:
     sha256: str
     """Hash of the file in the library."""
     bytes: int
-    """Size of that file."""
+    """Size of the file in the library."""
     origin: str
-    """Path of the file that it was derived from, relative to the root of the imported data."""
+    """Path of the file that it was derived from, relative to the root of the imported data or
+    package; for the user's own assets, its name only."""
     licence: str
     """Stated licence: an SPDX id, with a remark if needed, or ``unstated``."""
 
@@ -65,12 +66,12 @@ class TaskEntry:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Content of ``manifest.json``."""
+    """Content of a library source's ``manifest.json``."""
 
     source: str
     """Name of the library source, such as ``checkout``."""
     origin: str
-    """What it was made from: a package with version and hash, or a folder's name."""
+    """What it was made from, such as a package with version and hash, or a checkout's name."""
     imported_at: str
     """UTC time, ISO 8601."""
     defects: list[str] = field(default_factory=list)
@@ -78,7 +79,7 @@ class Manifest:
     files: dict[str, FileEntry] = field(default_factory=dict)
     """Files by path relative to the source's folder."""
     tasks: dict[str, TaskEntry] = field(default_factory=dict)
-    """Tasks that this source serves."""
+    """Tasks that this source has, by task id."""
     hands: list[str] = field(default_factory=list)
     """Hands that this source provides."""
     objects: list[str] = field(default_factory=list)

@@ -74,8 +74,8 @@ def import_tcdm(
         replace: import even if tasks are lost that an earlier checkout provided.
 
     Raises:
-        LibraryError: the folder is not a checkout or has no complete task, tasks would be lost, or
-            the library cannot be written.
+        LibraryError: the folder is not a checkout, or has no table scene or no complete task; tasks
+            would be lost; or the library cannot be written.
         CorruptAssetError: a file is damaged; the library remains unchanged.
     """
     tree = locate(path)
@@ -169,14 +169,16 @@ def normalised(arrays: Mapping[str, Any], label: str) -> dict[str, np.ndarray]:
     used, as in the released code.
 
     Raises:
-        CorruptAssetError: an array is missing, of a wrong shape, or not finite.
+        CorruptAssetError: an array is missing, of a wrong shape, or not finite; ``length`` is not
+            a possible number of poses; there is not one pose per control step; or there is no
+            start state.
     """
     rows = motion_file.numbers(arrays, "object_translation", label, (None, 3))
     orientations = motion_file.numbers(arrays, "object_orientation", label, (len(rows), 4))
     length = float(motion_file.numbers(arrays, "length", label, ()))
     if length != int(length) or not 2 <= length <= len(rows):
         raise CorruptAssetError(
-            f"{label}: 'length' is {length:g}, but there are {len(rows)} object poses"
+            f"{label}: 'length' is {length:g}; valid: 2 to {len(rows)}, the object poses"
         )
     steps = int(length)
     data_substeps = float(motion_file.numbers(arrays, "DATA_SUBSTEPS", label, ()))

@@ -17,10 +17,10 @@ HEIGHT_M = 0.005
 """Initial height of the object's lowest point above the table."""
 TIME_S = 4.0  # duration of the simulation
 SINK_M = 0.002
-"""Largest final depth of the lowest point below the table top; the contact margin is 0.5 mm."""
+"""An object at rest is less deep than this in the table; the contact margin is 0.5 mm."""
 DRIFT_M = 0.03
-"""Largest horizontal displacement in the second half of the simulation."""
-REST_M_S, REST_RAD_S = 0.01, 0.1  # largest final speeds
+"""An object at rest moves less than this horizontally in the second half of the simulation."""
+REST_M_S, REST_RAD_S = 0.01, 0.1  # an object at rest is slower at the end
 _TABLE = """<mujoco><option timestep="0.004" iterations="20" noslip_iterations="20"/>
 <default><geom friction="1 0.5 0.01" margin="0.0005"/></default>
 <worldbody><geom type="box" size="0.45 0.45 0.025" pos="0 0 -0.025"/></worldbody></mujoco>"""
@@ -36,7 +36,7 @@ class Drop:
     turned_rad: float
     """Angle of the rotation from the initial orientation."""
     sunk_m: float
-    """Depth of its lowest point below the table top."""
+    """Depth of its lowest point below the table top, at least 0."""
     drift_m: float
     """Horizontal displacement of its centre of mass in the second half of the simulation."""
     speed_m_s: float  # of the centre of mass
@@ -44,7 +44,7 @@ class Drop:
 
     @property
     def rests(self) -> bool:
-        """Whether it is at rest on the table."""
+        """Whether it is at rest on the table: slow, not sunk in, not drifting (limits above)."""
         still = self.speed_m_s < REST_M_S and self.turn_rad_s < REST_RAD_S
         return still and self.sunk_m < SINK_M and self.drift_m < DRIFT_M
 

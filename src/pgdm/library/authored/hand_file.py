@@ -1,8 +1,8 @@
 """Reading a user's hand from MJCF or URDF into one plain MJCF, without executing anything in it.
 
-The XML is checked before MuJoCo sees it: no entities, no plug-ins, no file outside a given
-folder, no NaN. MuJoCo then parses and compiles it in a child process with limits of time and
-memory.
+The XML is checked before MuJoCo sees it: no entities, no macros, no plug-ins, no file outside
+a given folder, no NaN or infinity, limited size and depth. MuJoCo then parses and compiles it in a
+child process with limits of time and memory.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def _check_numbers(element: ET.Element, label: str) -> None:
 
 
 def _inside(name: str, folder: Path, root: Path, label: str) -> Path:
-    """Resolve a file name; seek ``package://`` paths in ``root``, also without first folders."""
+    """Resolve a file name; seek ``package://a/b/c`` as ``a/b/c``, ``b/c`` or ``c`` in ``root``."""
     if name.startswith("package://"):
         rest = Path(name.removeprefix("package://"))
         places = [root / rest, *(root / Path(*rest.parts[k:]) for k in range(1, len(rest.parts)))]
@@ -211,7 +211,8 @@ def _urdf(robot: ET.Element, path: Path, root: Path, notes: list[str]) -> list[P
         limit = joint.find("limit")
         if kind != "fixed" and (limit is None or not _has_range(limit)):
             raise CorruptAssetError(
-                f"{path.name}: joint '{name}' has no limits; add <limit lower= upper=> to it"
+                f"{path.name}: joint '{name}' has no limits; add <limit lower= upper=> to it, "
+                "with two finite numbers, lower < upper"
             )
         if limit is not None and float(limit.get("effort") or 0) <= 0:
             limit.attrib.pop("effort", None)  # otherwise MuJoCo would limit the force to zero
@@ -236,12 +237,12 @@ def _urdf(robot: ET.Element, path: Path, root: Path, notes: list[str]) -> list[P
         for texture in material.findall("texture"):
             material.remove(texture)
     if unseen:
-        notes.append(f"{unseen} visual meshes are neither STL nor OBJ and were left out")
+        notes.append(f"{unseen} visual meshes are neither STL, OBJ nor MSH and were left out")
     for mesh in robot.iter("mesh"):
         name = mesh.get("filename", "")
         if Path(name).suffix.lower() not in MESHES:
             raise CorruptAssetError(
-                f"{path.name}: collision mesh '{name}' is neither STL nor OBJ; convert it"
+                f"{path.name}: collision mesh '{name}' is neither STL, OBJ nor MSH; convert it"
             )
         found.append(_inside(name, path.parent, root, path.name))
         mesh.set("filename", str(found[-1]))
@@ -257,7 +258,11 @@ def _has_range(limit: ET.Element) -> bool:
 
 
 def _resolve_mimics(robot: ET.Element, label: str) -> None:
-    """Make each mimic joint follow a joint that mimics none: q = m (m' q' + o') + o."""
+    """Make each mimic joint follow a joint that mimics none.
+
+    If the joint is m times its leader plus o, and the leader m' times a joint q' plus o', the joint
+    is m (m' q' + o') + o.
+    """
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
     for name, joint in joints.items():
         mimic = joint.find("mimic")
@@ -287,7 +292,9 @@ def _line(mimic: ET.Element, label: str) -> tuple[float, float]:
     try:
         return float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
     except ValueError as error:
-        raise CorruptAssetError(f"{label}: <mimic> holds a non-number ({error})") from error
+        raise CorruptAssetError(
+            f"{label}: <mimic> has a value that is not a number ({error})"
+        ) from error
 
 
 def _compiled(xml: str, label: str, notes: list[str]) -> mujoco.MjSpec:

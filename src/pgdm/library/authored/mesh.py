@@ -25,7 +25,8 @@ MAX_FACES = 20_000
 200,000.)"""
 
 _THIN_M = 5e-4  # the models' contact margin; an object must be at least as thick
-_OPEN_SHARE = 0.5  # an open surface with a smaller share of its hull's volume is refused
+# An open surface with a smaller share of its hull's volume is refused, unless a mass is given.
+_OPEN_SHARE = 0.5
 _MAX_BODIES = 50
 _LID_SHARE = 0.15  # holes are filled if the lids have at most this share of the surface's area
 _READ_ERRORS = (
@@ -51,7 +52,7 @@ class SoundMesh:
     num_bodies: int
     """Number of disconnected pieces."""
     repairs: list[str]
-    """What was changed, one sentence each."""
+    """What was changed or assumed, one sentence each."""
 
     def trimesh(self) -> trimesh.Trimesh:
         """Return the mesh as a ``trimesh.Trimesh``."""
@@ -68,8 +69,9 @@ def read(path: Path, scale: float = 1.0, allow_open: bool = False) -> SoundMesh:
 
     Raises:
         ConfigError: the format is not supported, there is no such file, or the size is implausible
-            in this unit; the message suggests a unit.
-        CorruptAssetError: the file is unreadable, empty, flat, or encloses no volume.
+            in this unit; the message suggests a unit if one fits.
+        CorruptAssetError: the file is unreadable or empty, has NaN or infinite vertices, is flat,
+            encloses almost no volume, has more than 50 pieces, or is open without ``allow_open``.
     """
     mesh = _load(path)
     repairs: list[str] = []
@@ -134,7 +136,7 @@ def length(metres: float) -> str:
 
 
 def _clean(mesh: trimesh.Trimesh, label: str, repairs: list[str]) -> None:
-    """Merge equal vertices and remove degenerate and duplicate faces."""
+    """Merge equal vertices, remove degenerate and duplicate faces, and refuse a flat mesh."""
     before = len(mesh.vertices)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if merged := before - len(mesh.vertices):
@@ -187,7 +189,10 @@ def _close(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bo
 
 
 def _fill(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: bool) -> None:
-    """Fill small holes; refuse a large opening, such as a bowl's, or leave it open if allowed."""
+    """Fill all holes if they are small in total.
+
+    Otherwise, as for a bowl, refuse the mesh or leave the surface open if allowed.
+    """
     share = opening(mesh) / float(mesh.area)
     if share > _LID_SHARE:
         if not allow_open:
@@ -206,7 +211,7 @@ def _fill(mesh: trimesh.Trimesh, label: str, repairs: list[str], allow_open: boo
     mesh.vertices = np.concatenate((mesh.vertices, middles))
     mesh.faces = np.concatenate((mesh.faces, fans))
     holes = "a hole" if count == 1 else f"{count} holes"
-    repairs.append(f"filled {holes} with {len(fans)} faces, {share:.1%} of its area")
+    repairs.append(f"filled {holes} with {len(fans)} faces, {share:.1%} of the surface's area")
 
 
 def is_closed(mesh: trimesh.Trimesh) -> bool:

@@ -118,7 +118,8 @@ def author_object(request: ObjectRequest, progress: StepProgress = silent) -> Au
         progress: receives the progress of the convex decomposition.
 
     Raises:
-        ConfigError: a value is out of range, or the name is taken.
+        ConfigError: a value is out of range, the name is invalid or taken, or the mesh's format or
+            size is not accepted.
         CorruptAssetError: the mesh cannot be used; the message gives the reason.
         LibraryError: the mesh cannot be decomposed, the drop test diverges, or the user's folder
             cannot be written.
@@ -223,7 +224,10 @@ def _inertial(body: Body) -> dict[str, str]:
     matrix = body.inertia
     least = float(np.linalg.eigvalsh(matrix).min())
     if least <= 0.0:
-        raise CorruptAssetError(f"the mesh's inertia is not positive ({least:.2g} kg m2)")
+        raise CorruptAssetError(
+            f"the mesh's smallest principal inertia is {least:.2g} kg m2, not "
+            "positive; repair the mesh in your mesh editor"
+        )
     entries = [matrix[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     full = " ".join(f"{entry:.9g}" for entry in entries)
     return {"pos": "0 0 0", "mass": f"{body.mass_kg:.9g}", "fullinertia": full}

@@ -47,13 +47,18 @@ def read() -> Manifest:
 def check_object_name(name: str, replace: bool) -> None:
     """Check that a new object may have this name.
 
+    Args:
+        name: the name.
+        replace: whether an object of the user's may be replaced.
+
     Raises:
-        ConfigError: the name is invalid, used by the library, or by the user without ``replace``.
+        ConfigError: the name is invalid, or used by the benchmark, another library source, a task
+            or hand of the user's, or, without ``replace``, an object of the user's.
     """
     if not _OBJECT_NAME.fullmatch(name) or len(name) > _LONGEST:
         raise ConfigError(
             f"object name '{name}' is not valid: a lower-case letter, then lower-case letters, "
-            f"digits and '_' ('-' separates the words of task ids), {_LONGEST} at most"
+            f"digits and '_' ('-' separates the words of task ids), at most {_LONGEST} characters"
         )
     library, own = open_library(), read()
     taken = {o for s, m in library.sources().items() if s != staging.OWN for o in m.objects}
@@ -76,18 +81,19 @@ def check_hand_name(name: str, shipped: Collection[str], replace: bool) -> None:
         replace: whether a hand of the user's may be replaced.
 
     Raises:
-        ConfigError: the name is invalid, used by the library, or by the user without ``replace``.
+        ConfigError: the name is invalid, or used by pgdm, another library source, an object or task
+            of the user's, or, without ``replace``, a hand of the user's.
     """
     if not _OBJECT_NAME.fullmatch(name) or len(name) > _LONGEST:
         raise ConfigError(
             f"hand name '{name}' is not valid: a lower-case letter, then lower-case letters, "
-            f"digits and '_', {_LONGEST} at most"
+            f"digits and '_', at most {_LONGEST} characters"
         )
     library, own = open_library(), read()
     taken = {h for s, m in library.sources().items() if s != staging.OWN for h in m.hands}
     things = {o for m in library.sources().values() for o in m.objects}
     if name in taken | things | {*HANDS, *shipped}:
-        raise ConfigError(f"hand name '{name}' is taken by the library; choose another one")
+        raise ConfigError(f"hand name '{name}' is taken by a hand or an object; choose another one")
     if name in own.hands and not replace:
         raise ConfigError(f"you already have a hand '{name}'; --replace replaces it")
     if name in own.tasks:
@@ -103,12 +109,13 @@ def check_task_name(task: str, shipped: Collection[str], replace: bool) -> None:
         replace: whether a task of the user's may be replaced.
 
     Raises:
-        ConfigError: the id is invalid, used by pgdm, or by the user without ``replace``.
+        ConfigError: the id is invalid, or used by pgdm, an object of the user's, or, without
+            ``replace``, a task of the user's.
     """
     if not _TASK_NAME.fullmatch(task) or len(task) > _LONGEST:
         raise ConfigError(
             f"task id '{task}' is not valid: a lower-case letter, then lower-case letters, digits, "
-            f"'-' and '_', {_LONGEST} at most"
+            f"'-' and '_', at most {_LONGEST} characters"
         )
     if task in (*shipped, *BENCHMARK_TASKS):
         raise ConfigError(f"task id '{task}' is taken by pgdm; choose another one")
@@ -246,7 +253,7 @@ def facts(name: str, kind: str = "object") -> dict[str, Any]:
 
     Raises:
         UnknownNameError: the user has no such object or hand.
-        LibraryError: the record is damaged.
+        LibraryError: the record is missing or damaged.
     """
     check_name(f"{kind} of your own", name, getattr(read(), f"{kind}s"))
     path = folder() / f"{kind}s" / name / f"{kind}.json"

@@ -31,7 +31,7 @@ class PartsCfg:
     threshold: float = 0.05
     """Largest remaining concavity, relative to the size (0.01..1); lower values give more parts."""
     max_parts: int | None = None
-    """Largest number of parts; None: as many as the threshold requires."""
+    """Largest number of parts, 1 to 64; None: as many as the threshold requires."""
 
     def check(self) -> None:
         """Check the values.
@@ -62,7 +62,8 @@ class Part:
 def convex_parts(mesh: SoundMesh, cfg: PartsCfg, progress: StepProgress = silent) -> list[Part]:
     """Decompose a mesh into convex parts (CoACD), or return the cached result.
 
-    Equal input always gives equal parts. A convex mesh is returned as a single part.
+    Equal input always gives equal parts. A closed convex mesh in one piece is returned as a single
+    part.
 
     Args:
         mesh: the mesh.
@@ -71,7 +72,7 @@ def convex_parts(mesh: SoundMesh, cfg: PartsCfg, progress: StepProgress = silent
 
     Raises:
         ConfigError: a setting is out of range.
-        LibraryError: the decomposition failed, or gave no parts or too many.
+        LibraryError: the decomposition failed, or gave no parts or more than 64.
     """
     cfg.check()
     cache = paths.home() / "parts" / f"{_key(mesh, cfg)}.npz"
@@ -156,7 +157,7 @@ def _in_background(
 
 
 def _sound(raw: list[tuple[np.ndarray, np.ndarray]]) -> list[Part]:
-    """Return the hulls of the parts that have a volume, the largest first."""
+    """Return the hulls of the parts that are not slivers, the largest first."""
     hulls = []
     for vertices, _ in raw:
         try:

@@ -61,7 +61,8 @@ def compare(
 
     Bodies, joints, geoms, tendons and actuators are matched by name, unnamed geoms by their index
     in their body, pairs by their geoms. Sites, cameras, lights, materials and keyframes do not
-    affect the physics and are ignored.
+    affect the physics and are ignored. Equality constraints and contact exclusions are not compared
+    either.
 
     Args:
         first: one model.

@@ -1,4 +1,4 @@
-"""Compiling models, with the same centre of mass of massless bodies as in earlier MuJoCo."""
+"""Compiling models, with a massless tracked body's centre of mass as in MuJoCo up to 3.3."""
 
 from __future__ import annotations
 

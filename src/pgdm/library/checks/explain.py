@@ -67,7 +67,7 @@ def explain_expert(library: Library, task: str) -> Iterator[str]:
     kind = "rebuilt, approximate" if entry.approximate else "published"
     yield f"\nexpert hand trajectory ({kind}): {entry.package}, {index.made_at}"
     yield f"  experts/{task}.npz  sha256 {file.sha256[:16]}  {file.licence}  from {file.origin}"
-    yield f"  poses: {entry.steps}, after {entry.skipped} frames of the recording"
+    yield f"  poses: {entry.steps}, after {entry.skipped} skipped frames of the recording"
     moved = ", ".join(f"{1e3 * x:.1f}" for x in entry.shift_m)
     yield (
         f"  its object deviates from the motion's by {1e3 * entry.object_mean_m:.3f} mm (mean), "
@@ -76,7 +76,7 @@ def explain_expert(library: Library, task: str) -> Iterator[str]:
     )
     yield (
         f"  exceeds joint limits by up to {entry.beyond_limits_rad:.2f} rad and, at the base, "
-        f"{entry.beyond_limits_m:.2f} m (methods clip it)"
+        f"{entry.beyond_limits_m:.2f} m (methods clip the joints)"
     )
     if entry.approximate:
         yield f"  over all {entry.steps} poses (the recording has no contact flag), by finger:"
@@ -87,7 +87,7 @@ def explain_expert(library: Library, task: str) -> Iterator[str]:
 
 
 def needed(library: Library, task: str, source: str) -> list[str]:
-    """Return a source's files of a task, relative to the source's folder."""
+    """Return a source's models and motion of a task, relative to the source's folder; no meshes."""
     entry = library.entry(task, source)
     every = [
         "scene/table.xml",

@@ -24,7 +24,9 @@ START_SPEED_M_S, START_TURN_RAD_S = 0.1, 1.0
 """Largest accepted speeds in the first step, as a motion must start at rest."""
 SUNK_M = 0.003
 """Largest accepted depth of the object's lowest point below the table top."""
-_JUMP = 4.0  # a step this many times as fast as its neighbours is a discontinuity
+# A step over the speed limit is a jump if it is more than this many times as fast as the median of
+# the three steps before and after it.
+_JUMP = 4.0
 _SMOOTH_STEPS, _EASE_STEPS = 2.0, 8  # filter's sigma, poses added at each end
 _LIFT_STEPS = 6  # number of poses raised before and after a pose that is too low
 
@@ -48,7 +50,8 @@ def check_motion(poses: Poses, label: str) -> None:
     """Check length, jumps, speeds, accelerations, and that the object starts at rest.
 
     Raises:
-        ConfigError: a check fails; the message names the row and the option that helps.
+        ConfigError: a check fails; the message names the row and the option that helps, if there
+            are any.
     """
     steps = len(poses.pos)
     if not STEPS[0] <= steps <= STEPS[1]:
@@ -93,7 +96,7 @@ def _around(values: np.ndarray, row: int) -> float:
 
 
 def smoothed(poses: Poses) -> Poses:
-    """Return the motion low-pass filtered, at rest at start and end."""
+    """Return the motion low-pass filtered, with 8 poses added at each end so that both rest."""
     rows = np.concatenate((poses.pos, continuous(poses.quat)), axis=1)
     padded = np.pad(rows, ((_EASE_STEPS, _EASE_STEPS), (0, 0)), mode="edge")
     filtered = gaussian_filter1d(padded, _SMOOTH_STEPS, axis=0, mode="nearest")
@@ -151,7 +154,7 @@ class TableCheck:
             )
 
     def lifted(self, poses: Poses) -> Poses:
-        """Return the motion, raised smoothly where the object sinks below the table top."""
+        """Return the motion, raised smoothly around poses that sink below the table top."""
         depths = self.depths(poses)
         around = maximum_filter1d(depths, 2 * _LIFT_STEPS + 1, mode="nearest")
         raised = np.maximum(gaussian_filter1d(around, _LIFT_STEPS / 3, mode="nearest"), depths)

@@ -8,7 +8,7 @@ from pgdm.library.progress import StepProgress, counted, silent
 
 
 def damaged(library: Library, progress: StepProgress = silent) -> list[str]:
-    """Hash every file of the library and list those that are missing or changed.
+    """Hash every file of the library; list damaged manifests, and missing or changed files.
 
     Args:
         library: the library.
@@ -16,6 +16,9 @@ def damaged(library: Library, progress: StepProgress = silent) -> list[str]:
 
     Returns:
         A line per damaged file; empty if all files are intact.
+
+    Raises:
+        CorruptAssetError: the index of the expert trajectories is damaged.
     """
     left_out = set(present(library.root)) - set(library.sources())
     found = [f"{source}/manifest.json: damaged" for source in sorted(left_out)]

@@ -21,7 +21,7 @@ BONE_M = 0.02
 """Length of a finger's last bone."""
 
 RADII_M = np.array([0.008, 0.008, 0.007, 0.008, 0.009])
-"""Radius of each finger's last bone."""
+"""Radius of each finger's last bone, in the order of `FINGERS`."""
 
 CONTACT_M = 0.008
 """A finger closer than this is in contact, if the recording flags the hand as in contact."""

@@ -91,7 +91,7 @@ class _Builder:
         self.left_out.pop(task, None)
 
     def keep(self, task: str, entry: ExpertEntry) -> None:
-        """Keep a trajectory already in the library if it is intact and fits the motion."""
+        """Keep a trajectory already in the library if it is intact and as long as the motion."""
         present = staging.folder_of(self._library.root, staging.EXPERTS)
         assert present is not None
         file = present / f"{task}.npz"
@@ -121,7 +121,7 @@ def fill(
     progress: StepProgress = silent,
     recordings: Path | None = None,
 ) -> ExpertIndex:
-    """Fill the folder; the caller must hold the library's lock.
+    """Fill the library's folder ``experts``; the caller must hold the library's lock.
 
     A recording that is damaged or does not fit its motion is left out and the reason recorded.
     Tasks whose motion the library lacks are skipped.

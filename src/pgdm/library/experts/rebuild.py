@@ -59,7 +59,7 @@ class _Pair:
 class Rebuilder:
     """Fits a regression on all motions recorded with both hands, and rebuilds trajectories with it.
 
-    The result depends only on the packages and the type of machine.
+    The result depends only on the packages, the library and the type of machine.
 
     Args:
         library: contains the motions and the models of table, hand and objects.
@@ -94,8 +94,8 @@ class Rebuilder:
             task: task id with a recording of MyoHand.
 
         Raises:
-            CorruptAssetError: the recording is damaged, or its object does not follow the task's
-                motion.
+            CorruptAssetError: the recording or a model is damaged, or the recording is too short,
+                or its object does not follow the task's motion.
             UnknownNameError: the library lacks the task.
         """
         motion = self._library.motion(task)

@@ -50,7 +50,8 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
         label: the file's name in messages.
 
     Raises:
-        CorruptAssetError: a column is missing, or two columns have the same meaning.
+        CorruptAssetError: rows do not have C columns, a column of the pose is missing, or two have
+            the same meaning. (Of several time columns, the first is used.)
     """
     if rows.ndim != 2 or rows.shape[1] != len(names):
         raise CorruptAssetError(
@@ -70,7 +71,10 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
 
 
 def by_place(rows: np.ndarray, times: np.ndarray | None = None) -> Table:
-    """Return the poses of a table without column names: `POSE`, after the time if 8 columns."""
+    """Return the poses of a table without column names, whose columns are `POSE`.
+
+    If there are eight columns and no ``times``, the first column is the time.
+    """
     if rows.ndim == 2 and rows.shape[1] == 8 and times is None:
         rows, times = rows[:, 1:], rows[:, 0]
     note = f"the columns have no names and were read as {' '.join(POSE)}"
@@ -87,7 +91,8 @@ def check_order(quat: np.ndarray, rest: Rotation, label: str, cure: str) -> None
         cure: advice in the message on how to state the order.
 
     Raises:
-        ConfigError: read as wxyz it is far from the resting orientation, read as xyzw it is near.
+        ConfigError: read as wxyz it is tilted or rotated far from the resting orientation, read as
+            xyzw it is near in the same measure.
     """
     taken, other = (Rotation.from_quat(quat, scalar_first=f) * rest.inv() for f in (True, False))
     tilts = [float(np.arccos(np.clip(r.as_matrix()[2, 2], -1, 1))) for r in (taken, other)]

@@ -18,7 +18,7 @@ HAND = "adroit"
 FINGERS = ("ff", "mf", "lf", "rf", "th")
 """Order of the fingers in all arrays: index, middle, little, ring finger, thumb."""
 FINGERTIPS = tuple(f"{finger}distal_point" for finger in FINGERS)
-"""Fingertips of that hand, as geoms and bodies of its model."""
+"""Adroit's fingertips, as geoms and bodies of its model."""
 
 JOINTS = 30
 """Number of Adroit's joints: six of the base, then wrist and fingers."""
@@ -62,7 +62,8 @@ def check(arrays: Mapping[str, Any], label: str) -> dict[str, np.ndarray]:
         label: the file's name in messages.
 
     Raises:
-        CorruptAssetError: an array is missing, has a wrong shape or type, or is not finite.
+        CorruptAssetError: an array is missing, has a wrong shape, type or value, or is not finite,
+            or there are fewer than two rows.
     """
     qpos = numbers(arrays, "qpos", label, (None, JOINTS))
     steps, fingers = len(qpos), len(FINGERS)

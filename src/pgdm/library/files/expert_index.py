@@ -33,25 +33,27 @@ class ExpertEntry:
     """Offset (3,) m, world frame, added to the recorded positions so that the object is where the
     motion has it."""
     object_mean_m: float
-    """Distance of the recording's object from the motion's after that shift, mean over poses."""
+    """Distance of the recording's object from the motion's after ``shift_m``, mean over poses."""
     object_max_m: float
-    """Largest such distance over the poses."""
+    """Largest distance of the recording's object from the motion's after ``shift_m``."""
     beyond_limits_m: float
     """Largest excess of the base's slides over their limits."""
     beyond_limits_rad: float
     """Largest excess of the hinges over their limits."""
     touching_frames: int
-    """Number of poses at which the hand touches the object according to the recording."""
+    """Number of poses at which the hand touches the object according to the recording; all
+    poses if the recording has no contact flag."""
     contact_frames: list[int]
     """Of the ``touching_frames`` poses, the number with each finger in contact (index, middle,
     little, ring, thumb)."""
     within_5mm: list[float]
-    """Of the ``touching_frames`` poses, the share with each finger within 5 mm of the object."""
+    """Of the ``touching_frames`` poses, the share with each finger less than 5 mm from the
+    object."""
 
 
 @dataclass(frozen=True)
 class ExpertIndex:
-    """Content of the folder's ``manifest.json``."""
+    """Content of ``manifest.json`` in the folder of the expert trajectories."""
 
     made_at: str
     """UTC time, ISO 8601."""

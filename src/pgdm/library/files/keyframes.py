@@ -68,13 +68,16 @@ class Animation:
         return self.keyframes[-1].time_s
 
     def trajectory(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions (T, 3) m and orientations (T, 4) wxyz, one per control step."""
+        """Return positions (T, 3) m and orientations (T, 4) wxyz, one per control step.
+
+        As in the keyframes, they are relative to the resting pose if the frame is ``rest``.
+        """
         steps = int(np.ceil(self.length_s / STEP_S - 1e-9))
         times = np.minimum(STEP_S * np.arange(steps + 1), self.length_s)
         return sample(self.keyframes, times)
 
     def at(self, pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the trajectory in the world frame, as :meth:`trajectory`, for a resting pose.
+        """Return the trajectory for a resting pose, shaped as by :meth:`trajectory`, world frame.
 
         Args:
             pos: centre of mass (3,) m of the resting object.
@@ -185,7 +188,7 @@ def parse(text: str, label: str) -> Animation:
         label: its name in messages.
 
     Raises:
-        ConfigError: an entry is wrong; the message names it.
+        ConfigError: the text is not YAML, or an entry is wrong; the message names it.
     """
     try:
         content = files.parse_yaml(text)
@@ -215,7 +218,7 @@ def animation(content: Mapping[str, Any], label: str) -> Animation:
         raise ConfigError(f"{label}: 'place' holds no keys; valid: {', '.join(_PLACE_KEYS)}")
     _known(place, _PLACE_KEYS, f"{label}: place")
     if place and frame == "world":
-        raise ConfigError(f"{label}: 'place' needs frame 'rest'; 'world' starts at keyframe 0")
+        raise ConfigError(f"{label}: 'place' needs frame 'rest'; in frame 'world', remove it")
     keys = content.get("keyframes")
     if not isinstance(keys, list) or len(keys) < 2:
         raise ConfigError(f"{label}: 'keyframes' must be a list of two or more")

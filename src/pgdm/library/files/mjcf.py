@@ -63,7 +63,7 @@ def add(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:
 
 
 def common_defaults(root: ET.Element) -> ET.Element:
-    """Append the default classes of TCDM's models and return the section."""
+    """Append the defaults shared by TCDM's models and return the section."""
     section = add(root, "default")
     for tag, values in _COMMON_DEFAULTS.items():
         add(section, tag, **values)

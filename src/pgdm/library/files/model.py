@@ -94,7 +94,9 @@ def name_in(path: Path, root: Path) -> str:
 def _inside(path: Path, root: Path, label: str) -> Path:
     path = Path(os.path.normpath(path))
     if not path.is_relative_to(root):
-        raise CorruptAssetError(f"{label}: refers to '{path}', which is outside the data tree")
+        raise CorruptAssetError(
+            f"{label}: refers to '{path}', which is outside the imported folder"
+        )
     check_stays(path, root)
     return path
 
@@ -103,7 +105,7 @@ def check_stays(path: Path, root: Path) -> None:
     """Check that a path in third-party data is not a link that leads out of ``root``.
 
     Raises:
-        CorruptAssetError: it is; the message names the file and its target.
+        CorruptAssetError: it is such a link; the message names the file and its target.
     """
     if leaves(path, root):
         raise CorruptAssetError(

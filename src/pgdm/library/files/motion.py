@@ -40,8 +40,9 @@ class Motion:
     source: str
     """Library source from which it was read, such as ``checkout``."""
     translation: np.ndarray = field(repr=False)
-    """Recorded position of the mesh's origin (T, 3) m, world frame. The released code uses it as
-    the target of the centre of mass, see `ReferenceCfg.frame`."""
+    """Target of the centre of mass (T, 3) m, world frame. In the benchmark's recorded motions it is
+    the position of the mesh's origin, which the released code uses as that target, see
+    `ReferenceCfg.frame`."""
     orientation: np.ndarray = field(repr=False)
     """Target of the object body's orientation (T, 4), unit quaternion wxyz."""
     substeps: int
@@ -66,8 +67,9 @@ def check(
         by name.
 
     Raises:
-        CorruptAssetError: an array is missing, has a wrong shape, or is not finite, or a quaternion
-            is not unit.
+        CorruptAssetError: an array is missing, has a wrong shape, or is not finite; there are fewer
+            than two poses; a quaternion is not unit; or ``substeps`` is not a whole number from 1
+            to 1000.
     """
     translation = numbers(arrays, "object_translation", label, (None, 3))
     steps = len(translation)
@@ -77,7 +79,9 @@ def check(
     check_unit(orientation, "object_orientation", label)
     substeps = float(numbers(arrays, "substeps", label, ()))
     if not 1 <= substeps <= 1000 or substeps != int(substeps):
-        raise CorruptAssetError(f"{label}: substeps is {substeps}, not a whole number from 1")
+        raise CorruptAssetError(
+            f"{label}: substeps is {substeps}, not a whole number from 1 to 1000"
+        )
     starts = {}
     for name in STARTS:
         if f"start_{name}_qpos" in arrays:
@@ -86,7 +90,7 @@ def check(
 
 
 def check_unit(quaternions: np.ndarray, key: str, label: str) -> None:
-    """Check that quaternions (T, 4) have norm 1.
+    """Check that quaternions (T, 4) have norm 1, to within 0.001.
 
     Raises:
         CorruptAssetError: one does not; the message names the worst row.

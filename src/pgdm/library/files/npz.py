@@ -35,7 +35,8 @@ def read_npz(path: Path) -> dict[str, Any]:
 
     Raises:
         UnsafePickleError: a pickled array requires more than plain values.
-        CorruptAssetError: the file is missing, truncated or not an ``.npz``.
+        CorruptAssetError: the file is missing, truncated, too large or not an ``.npz``, or an array
+            in it is unreadable.
     """
     return read_hashed(path)[0]
 

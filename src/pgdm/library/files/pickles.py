@@ -195,7 +195,10 @@ def _refused(label: str, what: str) -> UnsafePickleError:
 
 
 def _scan(data: bytes, label: str, objects: Sequence[str]) -> None:
-    """Refuse opcodes and names that plain values do not need, before loading anything."""
+    """Refuse opcodes and names that plain values do not need, before loading anything.
+
+    Names that STACK_GLOBAL takes from the stack are refused later, by ``find_class``.
+    """
     for opcode, arg, _ in pickletools.genops(data):
         if opcode.name not in _OPCODES and not (objects and opcode.name in _OBJECT_OPCODES):
             raise _refused(label, f"the opcode {opcode.name}")

