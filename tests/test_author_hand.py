@@ -190,6 +190,8 @@ def test_it_is_the_users_own_and_can_be_removed() -> None:
     assert (cfg.name, cfg.mount_body, len(cfg.points)) == ("made", "mount", 16)
     again = command("pgdm", "author", "hand", "hand.urdf", "--name", "made")
     assert again.errors == ["error: you already have a hand 'made'; --replace replaces it"]
+    with pytest.raises(ConfigError, match="you have a hand 'made'; choose another id"):
+        own.check_task_name("made", (), replace=False)
     assert command("pgdm", "author", "remove", "made", "--yes").code == 0
     assert not settings_path("made").exists() and not folder.exists()
     with pytest.raises(UnknownNameError, match="unknown object, hand or task of your own 'made'"):

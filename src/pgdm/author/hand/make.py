@@ -242,8 +242,7 @@ def _mounted(
     own_axes = np.stack((right, along, -facing), axis=1)
     turn = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
     # World axes: the little finger of a right hand is at +x, with fingers at +y and the palm down.
-    world = np.eye(3) * np.array([np.sign(np.linalg.det(own_axes)), 1.0, 1.0])
-    return turn @ world @ own_axes.T, "right" if right @ found.across > 0 else "left"
+    return turn @ own_axes.T, "right" if right @ found.across > 0 else "left"
 
 
 def _other_side(label: str, xml: str, side: str) -> str | None:

@@ -109,8 +109,8 @@ def check_task_name(task: str, shipped: Collection[str], replace: bool) -> None:
         replace: whether a task of the user's may be replaced.
 
     Raises:
-        ConfigError: the id is invalid, or used by pgdm, an object of the user's, or, without
-            ``replace``, a task of the user's.
+        ConfigError: the id is invalid, or used by pgdm, an object or hand of the user's, or,
+            without ``replace``, a task of the user's.
     """
     if not _TASK_NAME.fullmatch(task) or len(task) > _LONGEST:
         raise ConfigError(
@@ -122,8 +122,9 @@ def check_task_name(task: str, shipped: Collection[str], replace: bool) -> None:
     own = read()
     if task in own.tasks and not replace:
         raise ConfigError(f"you already have a task '{task}'; --replace replaces it")
-    if task in own.objects:
-        raise ConfigError(f"you have an object '{task}'; choose another id, such as {task}-lift")
+    for kind, names in (("an object", own.objects), ("a hand", own.hands)):
+        if task in names:
+            raise ConfigError(f"you have {kind} '{task}'; choose another id, such as {task}-lift")
 
 
 def add_model(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pgdm.errors import SceneError
 from pgdm.library import Motion, Start
 from pgdm.library.files.pregrasp import Pregrasp
 from pgdm.library.progress import Notify, StepProgress
@@ -70,8 +71,7 @@ def predict(
     Raises:
         ConfigError: the predictor is for another hand, the object is attached to something, or
             the motion does not store where objects start.
-        SceneError: no candidate can be freed from contact, the object's shape cannot be encoded, or
-            all simulations of a candidate's reach diverge.
+        SceneError: no candidate can be freed from contact, or the object's shape cannot be encoded.
     """
     held_out = _is_held_out(predictor, scene, notify)
     objects = reset_state(motion, scene)
@@ -80,10 +80,14 @@ def predict(
     found = ranked(found, lift, progress)
     chosen, plan = 0, None
     for i, candidate in enumerate(found[:_TRIES] if cfg.reach else ()):
-        tried = plan_reach(
-            scene, candidate.qpos, motion.substeps, seed=cfg.seed, num_threads=num_threads,
-            progress=lambda step, done, total, i=i: progress(f"plan {i + 1}", done, total),
-        )  # fmt: skip
+        try:
+            tried = plan_reach(
+                scene, candidate.qpos, motion.substeps, seed=cfg.seed, num_threads=num_threads,
+                progress=lambda step, done, total, i=i: progress(f"plan {i + 1}", done, total),
+            )  # fmt: skip
+        except SceneError as error:  # every simulation diverges
+            notify(f"candidate {i + 1} is not reached: {error}")
+            continue
         if tried.reached:
             chosen, plan = i, tried
             break

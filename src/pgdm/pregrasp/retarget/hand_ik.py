@@ -11,6 +11,7 @@ term pulls weakly towards the hand's mean pre-grasp, mean_f.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -56,6 +57,8 @@ class IkResult:
     """Deepest penetration between the hand and anything else."""
     at_limit: tuple[str, ...]
     """Names of the joints that are at a limit."""
+    slides_at_limit: tuple[str, ...]
+    """Those of them that are slides of the base."""
     targets: Targets = field(repr=False)
     """The targets that the errors refer to."""
 
@@ -185,13 +188,17 @@ class HandIk:
         low, high = model.jnt_range[:n].T
         hand = qpos[:n]
         at_limit = np.flatnonzero((hand < low + AT_LIMIT) | (hand > high - AT_LIMIT))
+        names = [model.joint(int(i)).name for i in at_limit]
+        is_slide = model.jnt_type[at_limit] == mujoco.mjtJoint.mjJNT_SLIDE
+        slides = is_slide & (at_limit < self.scene.index.num_base_joints)
         return IkResult(
             qpos=qpos,
             fingertip_errors_m=errors[shape.rows[:, 2]],
             points_error_m=float(np.average(errors, weights=targets.weights)),
             palm_error_rad=float(np.arccos(np.clip(cosine, -1.0, 1.0))),
             depth_m=self.contact.depth(qpos),
-            at_limit=tuple(model.joint(int(i)).name for i in at_limit),
+            at_limit=tuple(names),
+            slides_at_limit=tuple(itertools.compress(names, slides)),
             targets=targets,
         )
 

@@ -62,9 +62,7 @@ class Retargeted:
             for i in self.result.unreached
             if i in self.measured
         ]
-        # The names of the base's slides start with ART in all of the benchmark's hands.
-        slides = [n for n in self.result.at_limit if n.rpartition("/")[2].startswith("ART")]
-        if slides:
+        if slides := self.result.slides_at_limit:
             found.append(f"the base is at the end of {', '.join(slides)}")
         if self.result.depth_m > FREE_M:
             found.append(f"the hand is {1e3 * self.result.depth_m:.1f} mm inside something")
