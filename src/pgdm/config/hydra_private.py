@@ -181,7 +181,7 @@ class Loader:
 
 @contextmanager
 def _composing() -> Iterator[None]:
-    """Lock Hydra's global state, and skip the largest part of its work, not needed here."""
+    """Lock Hydra's global state, and skip maps that nothing reads, its slowest step."""
     with _LOCK:
         version.setbase(_VERSION_BASE)
         before = _defaults._create_interpolation_map
