@@ -62,7 +62,10 @@ def fetch(
 @app.command("import")
 def import_checkout(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="A TCDM checkout, or its data folder.")
+        Path,
+        typer.Argument(
+            metavar="PATH", help="A TCDM checkout, or its folder tcdm or tcdm/envs/assets."
+        ),
     ],
     replace: Annotated[
         bool,

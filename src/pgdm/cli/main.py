@@ -299,7 +299,8 @@ def view(
     """
     if (ablations or image is not None) and (video is not None or expert or not ablations):
         raise ConfigError(
-            "--ablations and --image FILE go together, without --video, --reach, --wrist, --expert"
+            "--ablations and --image FILE go together, without --video, --reach, --wrist and "
+            "--expert"
         )
     if reach + wrist + ablations + expert > 1:
         raise ConfigError("--reach, --wrist, --ablations and --expert exclude each other")

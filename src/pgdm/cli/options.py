@@ -188,7 +188,7 @@ Best = Annotated[
     bool,
     typer.Option(
         "--best",
-        help="Only a run's folder: use its checkpoint of highest success, if any, not its last.",
+        help="Only a run's folder: use the checkpoint of highest success, if any, not the last.",
     ),
 ]
 ZipTask = Annotated[

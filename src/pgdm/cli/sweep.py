@@ -168,8 +168,8 @@ def cancel(folder: Folder, jobs: Jobs = None) -> None:
 def retry(folder: Folder, jobs: Jobs = None) -> None:
     """Retry failed jobs.
 
-    Named jobs are retried whatever their state, unless running or finished. If another process
-    drives the sweep, it starts them; else this process does, and waits for them.
+    Named jobs are retried whatever their state, unless running or finished. If a process already
+    drives the sweep, that process starts the jobs; otherwise this command does, and waits for them.
     """
     ledger = settled(folder)
     wanted = _chosen(ledger, jobs)

@@ -75,7 +75,7 @@ def check_interfaces() -> None:
 
 
 class _ReadOnce(ConfigLoaderImpl):
-    """Hydra's loader, which here keeps files once read for all later compositions."""
+    """Hydra's loader, which here reads each file only once, for all compositions."""
 
     _files: Any = None
 

@@ -155,7 +155,8 @@ def simulate_playback(
     """Play a file open-loop on arm and hand in simulation, and print how many objects are held.
 
     Arm and hand follow the commands with joint controllers; the policy corrects nothing. An object
-    is held if it ends more than 2 cm above its start, and at least half as high as when exported.
+    is held if it ends more than 2 cm above its start, and rises at least half as far as in the
+    exported episode.
     """
     with loading():
         from pgdm.cli.deploy.simulate import SimulateRequest, run_simulate

@@ -42,7 +42,8 @@ def reach(
         bool,
         typer.Option(
             "--replace",
-            help="Plan again even if a plan is published or stored, unless this search made it.",
+            help="Plan again even if a plan is published or stored; a stored plan from the same "
+            "search and seed is kept.",
         ),
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
@@ -114,8 +115,8 @@ def mocap(
         int | None,
         typer.Option(
             min=0,
-            help="Frame of the recording; by default the last before contact, of the library's "
-            "expert the first.",
+            help="Frame of the recording; by default the last before contact in a FILE, the first "
+            "in the library's expert.",
         ),
     ] = None,
     reach: _Reach = True,

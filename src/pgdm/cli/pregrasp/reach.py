@@ -62,7 +62,8 @@ def run(request: Request) -> int:
         code = FAILED if failed else 0
     except KeyboardInterrupt:
         print(
-            "stopped; plans shown as stored are kept, and the same command plans the rest",
+            "stopped; plans that the table shows as stored are kept; the same command plans the "
+            "rest",
             file=sys.stderr,
         )
         code = INTERRUPTED
