@@ -92,7 +92,7 @@ def test_logs(ended: Path) -> None:
     assert sweep("logs", ended, "seed=1").out == "error: no room\n"
     assert sweep("logs", ended, "seed=1", "-f").out == "error: no room\n"
     assert "seed=2 has not been started yet" in sweep("logs", ended, "seed=2").errors[0]
-    assert "'seed' is in the names of 3 jobs" in sweep("logs", ended, "seed").errors[0]
+    assert "'seed' matches 3 jobs" in sweep("logs", ended, "seed").errors[0]
     assert "did you mean seed=1" in sweep("logs", ended, "sed=1").errors[0]
 
 

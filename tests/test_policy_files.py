@@ -249,7 +249,7 @@ def test_commands_say_what_fits(tmp_path: Path) -> None:
     outcome = command("pgdm", "eval", path, "--task", "cup-pour1", "--best")
     assert outcome.code == 2 and "--best is for the folder of a run" in outcome.err
     outcome = command("pgdm", "eval", "nothing.safetensors")
-    assert outcome.code == 2 and "there is no file 'nothing.safetensors'" in outcome.err
+    assert outcome.code == 2 and "there is no file or folder 'nothing.safetensors'" in outcome.err
     outcome = command("pgdm", "export", path, "--task", "cup-pour1", "--format", "onxx")
     assert outcome.code == 2 and "did you mean onnx?" in outcome.err
     policy = replace(tiny(), name="a")

@@ -15,7 +15,8 @@ def view_ablations(view: View, image: Path | None) -> None:
     """Write the contact sheet of a task's ablated starts.
 
     Raises:
-        PgdmError: if the task is unknown, its assets are missing, or nothing can be drawn.
+        PgdmError: if ``image`` is None, there is no pre-grasp to ablate, assets are missing, or
+            nothing can be drawn.
     """
     if image is None:
         raise ConfigError("--ablations needs --image FILE that ends in .png")

@@ -62,10 +62,14 @@ def fetch(
 @app.command("import")
 def import_checkout(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="A TCDM checkout, or its data folder.")
+        Path,
+        typer.Argument(
+            metavar="PATH", help="A TCDM checkout, or its folder tcdm or tcdm/envs/assets."
+        ),
     ],
     replace: Annotated[
-        bool, typer.Option("--replace", help="Import even if tasks in the library would be lost.")
+        bool,
+        typer.Option("--replace", help="Import even if tasks of an earlier import would be lost."),
     ] = False,
 ) -> None:
     """Import all tasks of a TCDM checkout.
@@ -145,7 +149,7 @@ def list_tasks() -> None:
 def verify() -> None:
     """Hash every file and list those that are damaged.
 
-    The exit code is 1 if there are any.
+    The exit code is 1 if there are any, or if the library is empty.
     """
     library = open_library()
     files = sum(1 for _ in library.files())

@@ -28,7 +28,7 @@ def compare_runs(runs: Sequence[Path], image: Path) -> None:
     changes = found.differences()
     _print("setting", found.names, {k: list(map(_shown, v)) for k, v in changes.items()})
     if not changes:
-        print("their settings are the same")
+        print("their settings are the same, apart from any that do not affect the result")
     _print("result", found.names, found.results())
     found.draw(image)
     print(f"curves: {image}")

@@ -49,12 +49,16 @@ def dashboard(
     root: Runs = None,
     port: Annotated[int, typer.Option(help="Port; if it is taken, another is used.")] = 5000,
     uri: Annotated[
-        str | None, typer.Option(help="Another MLflow store, such as sqlite:////data/x.db.")
+        str | None,
+        typer.Option(
+            help="MLflow store to show, such as sqlite:////data/x.db [MLFLOW_TRACKING_URI, else "
+            "mlflow.db in DIR]."
+        ),
     ] = None,
 ) -> None:
-    """Show runs in the browser with MLflow; Ctrl-C quits.
+    """Serve MLflow's web pages for a folder of runs; Ctrl-C quits.
 
-    The pages are served to this machine only.
+    The pages are served to this machine only, at the address that is printed.
     """
     root = (root or paths.runs()).absolute()
     address = chosen(uri, "--uri", notify) or store_uri(root)
@@ -87,7 +91,7 @@ def free_port(wanted: int) -> int:
 
 
 def _ensure_store(uri: str, root: Path) -> None:
-    """Fill a missing store from the run folders."""
+    """Fill a SQLite store from the run folders if its file is missing."""
     file = sqlite_file(uri)
     if file is None or file.exists():
         return
@@ -176,7 +180,7 @@ def _wait_until_up(server: subprocess.Popen[bytes], url: str, output: IO[bytes])
 
 
 def _page(url: str) -> str:
-    """Return the path, below ``url``, of the page of the latest experiment or of all of them."""
+    """Return the latest experiment's path below ``url``; if none, that of the experiment list."""
     query = {"max_results": 100, "order_by": ["last_update_time DESC"]}
     found = _asked(f"{url}/api/2.0/mlflow/experiments/search", query).get("experiments", [])
     ours = [str(e["experiment_id"]) for e in found if e.get("name") != "Default"]

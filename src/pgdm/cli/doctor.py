@@ -36,7 +36,7 @@ class Check(NamedTuple):
 
 
 def diagnose() -> int:
-    """Print the table; return 1 if something that every run needs does not work."""
+    """Print the table; return 1 if something that runs need by default does not work."""
     table = Table(box=None, header_style="bold")
     for name in ("subject", "", "what was found, or what to do"):
         table.add_column(name, overflow="fold")
@@ -85,9 +85,9 @@ def _machine() -> Iterator[Check]:
     enough = free >= ENOUGH_GB
     yield Check("memory", enough, f"{free:.1f} GB are free" if enough else cure)
     disk = shutil.disk_usage(_existing(paths.library())).free / 1e9
-    yield Check("disk", disk > 1, f"{disk:.1f} GB are free in {paths.library()}")
+    yield Check("disk", disk > 1, f"{disk:.1f} GB are free (needed: over 1) in {paths.library()}")
     if torch.cuda.is_available():
-        yield Check("GPU", True, f"{torch.cuda.get_device_name()}: device=cuda")
+        yield Check("GPU", True, f"{torch.cuda.get_device_name()}: used with device=cuda")
     else:
         yield Check("GPU", None, "torch finds none; device=cpu needs none")
     try:
@@ -95,7 +95,7 @@ def _machine() -> Iterator[Check]:
     except PgdmError as error:
         yield Check("MuJoCo Warp", None, str(error))
     else:
-        yield Check("MuJoCo Warp", True, "sim=warp")
+        yield Check("MuJoCo Warp", True, "used with sim=warp")
 
 
 def _library() -> Iterator[Check]:
@@ -133,7 +133,9 @@ def _slurm() -> Iterator[Check]:
     except PgdmError as error:
         yield Check("Slurm", None, f"sinfo failed; sweeps run on this machine ({error})")
     else:
-        yield Check("Slurm", True, f"{'; '.join(filter(None, nodes))}: hydra/launcher=slurm")
+        yield Check(
+            "Slurm", True, f"{'; '.join(filter(None, nodes))}: used with hydra/launcher=slurm"
+        )
 
 
 def _existing(folder: os.PathLike[str]) -> str:

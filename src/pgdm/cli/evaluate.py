@@ -20,11 +20,11 @@ class EvalRequest:
     policy: PolicyRequest
     """Which policy."""
     episodes: int | None
-    """Episodes of the sampled policy; None: as in the run's own evaluations."""
+    """Sampled episodes, and deterministic ones if the task is randomised; None: as in the run."""
     video: bool
-    """Whether to make a video of the policy as well."""
+    """Whether to make a video of one deterministic episode as well."""
     deterministic: bool
-    """Whether to skip the sampled policy."""
+    """Whether to report only the policy's mean action."""
     seed: int | None
     """Seed of the action noise and the task's own randomness; None: the run's."""
     offline: bool
@@ -35,7 +35,8 @@ def evaluate_policy(request: EvalRequest) -> int:
     """Print a policy's metrics and return the exit code.
 
     The code is 1 if a stored result is not reproduced, that of a stop signal if one arrived,
-    otherwise 0.
+    otherwise 0. A stored result is compared only if episodes, seed and ``deterministic`` are left
+    at their defaults.
 
     Raises:
         PgdmError: if the policy is missing or damaged, or does not fit its environment.

@@ -38,17 +38,17 @@ class ExportRequest:
     deterministic: bool
     """Only ``minari``: whether to take the policy's mean action."""
     seed: int | None
-    """Only ``minari``: seed of the noise; None: the run's."""
+    """Only ``minari``: seed of action noise and task randomisation; None: the run's."""
     offline: bool
     """Whether missing assets are an error instead of being fetched."""
 
 
 def export(request: ExportRequest) -> int:
-    """Write a policy and return the exit code.
+    """Write a policy or its episodes, and the scene if asked to; return the exit code.
 
     Raises:
-        PgdmError: if the policy cannot be read, its task does not compile, or a file cannot be
-            written.
+        PgdmError: if a package or an asset is missing, the policy cannot be read, its task does not
+            compile, or a file cannot be written.
     """
     check_installed(f"--format {request.form}", *_PACKAGES.get(request.form, ()))
     policy = open_policy(request.policy)

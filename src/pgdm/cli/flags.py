@@ -61,7 +61,7 @@ def read_flags(arguments: Sequence[str]) -> Flags:
     """Parse a command line.
 
     Raises:
-        ConfigError: if a flag is unknown, or lacks its value.
+        ConfigError: if a flag is unknown, or its value is missing or not valid.
     """
     flags, waiting = Flags(), list(arguments)
     while waiting:

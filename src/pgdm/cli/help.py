@@ -25,7 +25,7 @@ Examples
   pgdm-run +experiment=fast task=cup-pour1     the same task in 300,000 frames
   pgdm-run task=hammer-use1 total_frames=200_000 run_dir=out/a seed=3
   pgdm-run -m task=duck-lift,cup-pour1 seed=0,1,2     a sweep of six runs
-  pgdm-run -m 'task=tcdm30,dhand-*' --dry-run  show the plan of a sweep over suites
+  pgdm-run -m 'task=tcdm30,dhand-*' --dry-run  show a sweep's plan
   pgdm-run +sweep=validate_tcdm50 budget=smoke a short version of a study
   pgdm-run task=cup-pour1 --cfg job            print all settings, start nothing
   the same command again, or pgdm resume RUN   resumes a stopped run
@@ -35,7 +35,7 @@ _FLAGS = """\
 Flags
   -m, --multirun     a sweep: one run for each combination of values a,b,c
   --dry-run          show a sweep's plan, or the terms of one run; start nothing
-  --offline          never use the network; missing assets are an error
+  --offline          never download assets; use earlier downloads
   --config-dir DIR   add your own settings: DIR/task/mine.yaml is task=mine
   --cfg job          print all settings (--resolve: with references resolved)
   --info [WHAT]      where settings come from: config, defaults, searchpath, ...

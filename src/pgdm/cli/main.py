@@ -116,12 +116,12 @@ def evaluate(
         int | None,
         typer.Option(
             min=1,
-            help="Number of sampled episodes, and of deterministic ones if the task is randomised; "
-            "by default as in the run.",
+            help="Number of sampled episodes, and of deterministic episodes if the task is "
+            "randomised (else 1); by default as in the run.",
         ),
     ] = None,
     video: Annotated[
-        bool, typer.Option("--video", help="Also make a video of the policy.")
+        bool, typer.Option("--video", help="Also make a video of one deterministic episode.")
     ] = False,
     deterministic: Annotated[
         bool, typer.Option("--deterministic", help="Evaluate only the mean action, without noise.")
@@ -140,7 +140,9 @@ def evaluate(
 ) -> None:
     """Evaluate a trained policy.
 
-    The video is written to the run's folder, or to the current folder if the policy is not a run's.
+    If results are stored with the policy, as in the zoo, and --episodes, --seed and --deterministic
+    are not given, the exit code is 1 unless the stored numbers are reproduced bit-identically. The
+    video is written to the run's folder, or to the current folder if the policy is not a run's.
     """
     with loading():
         from pgdm.cli.evaluate import EvalRequest, evaluate_policy
@@ -174,7 +176,8 @@ def export_policy(
     scene: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Also write the scene, for plain MuJoCo, to this new folder."
+            metavar="FOLDER",
+            help="Also write the scene, for plain MuJoCo, to this new or empty folder.",
         ),
     ] = None,
     episodes: Annotated[
@@ -210,14 +213,22 @@ def resume(
     run: Run,
     total_frames: Annotated[
         int | None,
-        typer.Option(metavar="N", help="New total length in frames, more than trained so far."),
+        typer.Option(metavar="N", help="New total length, frames; it may only grow [unchanged]."),
     ] = None,
     time_limit_min: Annotated[
         float | None,
-        typer.Option(min=0, metavar="MIN", help="Time limit over all attempts; 0: no limit."),
+        typer.Option(
+            min=0,
+            metavar="MIN",
+            help="Time limit over all attempts, minutes; 0: no limit [unchanged].",
+        ),
     ] = None,
     uri: Annotated[
-        str | None, typer.Option(help="MLflow store to mirror to, such as http://host:5000.")
+        str | None,
+        typer.Option(
+            help="MLflow store to mirror to, such as http://host:5000 [MLFLOW_TRACKING_URI, else "
+            "mlflow.db in the folder of runs]."
+        ),
     ] = None,
     offline: Offline = False,
 ) -> None:
@@ -247,7 +258,7 @@ def compare(
 
 @app.command()
 def doctor() -> None:
-    """Check this machine: versions, memory, rendering, library, MLflow, Slurm, GPU."""
+    """Check this machine: versions, memory, disk, GPU, rendering, library, MLflow, Slurm."""
     with loading():
         from pgdm.cli.doctor import diagnose
 
@@ -288,7 +299,8 @@ def view(
     """
     if (ablations or image is not None) and (video is not None or expert or not ablations):
         raise ConfigError(
-            "--ablations and --image FILE go together, without --video, --reach and --expert"
+            "--ablations and --image FILE go together, without --video, --reach, --wrist and "
+            "--expert"
         )
     if reach + wrist + ablations + expert > 1:
         raise ConfigError("--reach, --wrist, --ablations and --expert exclude each other")
@@ -315,10 +327,18 @@ def write_report(
         typer.Argument(metavar="DIR...", help="Folders of runs, or names of MLflow experiments."),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write to [DIR/report].", metavar="FOLDER")
+        Path | None,
+        typer.Option(
+            help="Folder to write to [report/ in the first DIR, or in runs if that is an MLflow "
+            "experiment].",
+            metavar="FOLDER",
+        ),
     ] = None,
     uri: Annotated[
-        str | None, typer.Option(help="The MLflow store of the experiments [runs/mlflow.db].")
+        str | None,
+        typer.Option(
+            help="MLflow store of the experiments [MLFLOW_TRACKING_URI, else runs/mlflow.db]."
+        ),
     ] = None,
 ) -> None:
     """Compare runs with the paper on one page.

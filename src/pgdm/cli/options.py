@@ -65,7 +65,7 @@ def known_sources(names: list[str] | None) -> list[str] | None:
 def existing(path: Path | None) -> Path | None:
     """Reject the path of an input file or folder that does not exist."""
     if path is not None and not path.exists():
-        raise ConfigError(f"there is no file '{path}'; check the path")
+        raise ConfigError(f"there is no file or folder '{path}'; check the path")
     return path
 
 
@@ -133,7 +133,7 @@ Tasks = Annotated[
     list[str],
     typer.Argument(
         metavar="TASK...",
-        help="Tasks, or suites such as tcdm50.",
+        help="Tasks, suites such as tcdm50, or patterns such as 'dhand-*'.",
         callback=tasks_or_files,
         autocompletion=complete_tasks,
     ),
@@ -165,7 +165,7 @@ Source = Annotated[
 Video = Annotated[
     Path | None,
     typer.Option(
-        help="Write an MP4 to this file instead of opening a window.",
+        help="Write an MP4 to this file; without it, pgdm view opens a window.",
         callback=_ending(".mp4", "an MP4"),
     ),
 ]
@@ -180,23 +180,30 @@ Policy = Annotated[
     typer.Argument(
         metavar="POLICY",
         help="Folder of a run, one of its checkpoints, zoo:NAME (see pgdm zoo list), .safetensors "
-        "file from pgdm export, or .zip file from Stable-Baselines3's PPO.",
+        "or .safetensors.xz file, or .zip file from Stable-Baselines3's PPO.",
         callback=known_policy,
     ),
 ]
 Best = Annotated[
-    bool, typer.Option("--best", help="Use the checkpoint with the highest success, not the last.")
+    bool,
+    typer.Option(
+        "--best",
+        help="Only a run's folder: use the checkpoint of highest success, if any, not the last.",
+    ),
 ]
 ZipTask = Annotated[
     str | None,
-    typer.Option("--task", help="Only .zip: task it was trained on.", callback=_task_or_none),
+    typer.Option(
+        "--task", help="Only .zip: task the policy was trained on.", callback=_task_or_none
+    ),
 ]
 ZipSettings = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Only .zip: pgdm-run setting it was trained with [the paper's]; can be repeated.",
+        help="Only .zip: pgdm-run setting of the policy's training that differs from the paper's; "
+        "can be repeated.",
     ),
 ]
 ZipStatistics = Annotated[
@@ -204,9 +211,11 @@ ZipStatistics = Annotated[
     typer.Option(
         "--vecnormalize",
         metavar="FILE",
-        help="Only .zip: its saved VecNormalize statistics.",
+        help="Only .zip: file of VecNormalize.save with the policy's observation statistics.",
         callback=existing,
     ),
 ]
-Offline = Annotated[bool, typer.Option("--offline", help="Never use the network.")]
+Offline = Annotated[
+    bool, typer.Option("--offline", help="Never download assets; use earlier downloads.")
+]
 Runs = Annotated[Path | None, typer.Argument(metavar="DIR", help="Folder of runs [runs].")]

@@ -23,11 +23,11 @@ class PolicyRequest:
     best: bool = False
     """Whether to take the best checkpoint of a run folder instead of the last."""
     task: str | None = None
-    """Only ``.zip``: the task that it was trained on."""
+    """Only ``.zip``: the task that the policy was trained on."""
     settings: tuple[str, ...] = ()
     """Only ``.zip``: settings of the training that differ from the paper's."""
     vecnormalize: Path | None = None
-    """Only ``.zip``: file of a ``VecNormalize``."""
+    """Only ``.zip``: file written by ``VecNormalize.save``."""
     zoo: Zoo | None = None
     """Only ``zoo:``: which zoo; None: the default."""
 
@@ -36,7 +36,8 @@ def open_policy(request: PolicyRequest) -> TrainedPolicy:
     """Return the requested policy.
 
     Raises:
-        PgdmError: if the policy is missing or cannot be read, or an option is not for its kind.
+        PgdmError: if the policy is missing or cannot be read, or an option does not apply to this
+            kind of policy or is missing.
     """
     if request.text.startswith(PREFIX):
         if request.best or request.task or request.settings or request.vecnormalize:

@@ -64,14 +64,21 @@ class _ListByDefault(TyperGroup):
 app = typer.Typer(cls=_ListByDefault, help="List or remove runs, or rebuild MLflow from them.")
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
-Uri = Annotated[str | None, typer.Option(help="MLflow store to fill, such as http://host:5000.")]
+Uri = Annotated[
+    str | None,
+    typer.Option(
+        help="MLflow store to fill, such as http://host:5000 [MLFLOW_TRACKING_URI, else mlflow.db "
+        "in DIR]."
+    ),
+]
 
 
 Where = Annotated[
     list[str] | None,
     typer.Option(
         metavar="COLUMN=VALUE",
-        help="List only matching runs, as in task=cup* or status=failed; can be repeated.",
+        help="List only matching runs, as in task=cup* or status=failed; if repeated, runs must "
+        "match all.",
     ),
 ]
 Sort = Annotated[

@@ -62,7 +62,7 @@ app = typer.Typer(help="Follow, stop and resume sweeps.", no_args_is_help=True)
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the sweep.")]
 Jobs = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[JOB]...", help="Jobs, by part of their name or by their key."),
+    typer.Argument(metavar="[JOB]...", help="Jobs, by part of their name or start of their key."),
 ]
 Detach = Annotated[bool, typer.Option("--detach", help="Run in the background.")]
 
@@ -115,7 +115,9 @@ def watch(folder: Folder) -> None:
 @app.command()
 def logs(
     folder: Folder,
-    job: Annotated[str, typer.Argument(metavar="JOB", help="Part of the job's name, or its key.")],
+    job: Annotated[
+        str, typer.Argument(metavar="JOB", help="Part of the job's name, or start of its key.")
+    ],
     follow: Annotated[
         bool, typer.Option("-f", "--follow", help="Keep printing until the job ends.")
     ] = False,
@@ -142,7 +144,7 @@ def logs(
 
 @app.command()
 def cancel(folder: Folder, jobs: Jobs = None) -> None:
-    """Stop the named jobs, or all unfinished ones; running jobs save first."""
+    """Stop the named jobs, or all that have not finished or failed; running jobs save first."""
     queue = Queue(_ASK_S)
     ledger = settled(folder, queue)
     ended = (FINISHED, FAILED) if not jobs else (FINISHED,)
@@ -166,8 +168,8 @@ def cancel(folder: Folder, jobs: Jobs = None) -> None:
 def retry(folder: Folder, jobs: Jobs = None) -> None:
     """Retry failed jobs.
 
-    Named jobs are retried whatever their state, unless running or finished. Jobs run in this
-    process, or in the one that already drives the sweep.
+    Named jobs are retried whatever their state, unless running or finished. If a process already
+    drives the sweep, that process starts the jobs; otherwise this command does, and waits for them.
     """
     ledger = settled(folder)
     wanted = _chosen(ledger, jobs)
@@ -185,7 +187,7 @@ def retry(folder: Folder, jobs: Jobs = None) -> None:
 
 @app.command()
 def resume(folder: Folder, detach: Detach = False) -> None:
-    """Resume unfinished jobs.
+    """Resume all jobs that are not finished, including failed and cancelled ones.
 
     They run with the settings that the sweep was started with.
     """
@@ -234,7 +236,7 @@ def _one(entries: Sequence[Entry], text: str) -> Entry:
     if len(found) > 1:
         some = ", ".join(entry.name for entry in found[:3])
         raise SweepError(
-            f"'{text}' is in the names of {len(found)} jobs: {some}; give more of the name"
+            f"'{text}' matches {len(found)} jobs: {some}; give more of the name or key"
         )
     return found[0]
 

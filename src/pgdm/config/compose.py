@@ -42,7 +42,8 @@ class Composer:
     """Composes many experiments; reads each file, and composes each choice of options, only once.
 
     Args:
-        config_dir: a folder of the user's own settings, searched after pgdm's.
+        config_dir: a folder of the user's own settings, searched after pgdm's and before the
+            permanent one.
         overrides: as typed; only ``hydra.searchpath`` is read here.
 
     Raises:

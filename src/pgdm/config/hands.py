@@ -1,4 +1,4 @@
-"""The hand for which a task's motion was recorded."""
+"""The hand that the stored start states of a task's motion belong to."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def check_interfaces() -> None:
 
 
 class _ReadOnce(ConfigLoaderImpl):
-    """Hydra's loader, which here keeps files once read for all later compositions."""
+    """Hydra's loader, which here reads each file only once, for all compositions."""
 
     _files: Any = None
 
@@ -181,7 +181,7 @@ class Loader:
 
 @contextmanager
 def _composing() -> Iterator[None]:
-    """Lock Hydra's global state, and skip the largest part of its work, not needed here."""
+    """Lock Hydra's global state, and skip maps that nothing reads, its slowest step."""
     with _LOCK:
         version.setbase(_VERSION_BASE)
         before = _defaults._create_interpolation_map

@@ -76,7 +76,8 @@ def identity(cfg: ExperimentCfg) -> dict[str, Any]:
     """Return the keys (dotted) and values that change the result of an experiment.
 
     A key of ``ADDED_LATER`` is left out if it has the value listed there, so that an experiment
-    keeps the hash, folder and sweep job that it had before the key existed.
+    keeps the hash, folder and sweep job that it had before the key existed. Keys of
+    ``_ONLY_PLANNED`` are left out if the wrist is not planned.
     """
     idle = () if cfg.action.plans_wrist else _ONLY_PLANNED
     return {

@@ -35,7 +35,8 @@ def load_config(run_dir: str | os.PathLike[str]) -> ExperimentCfg:
 
     Raises:
         RunError: if the folder holds no run.
-        ConfigError: if the file is damaged, was edited wrongly, or was written by a newer pgdm.
+        ConfigError: if the file is damaged, was edited wrongly, was written by a newer pgdm, or
+            names a method of a module that is not trusted.
     """
     file = Path(run_dir) / CONFIG
     if not file.is_file():
@@ -60,7 +61,8 @@ def typed(plain: Mapping[str, Any], where: str, run_dir: str) -> ExperimentCfg:
         run_dir: folder of the run.
 
     Raises:
-        ConfigError: if they are damaged, were edited wrongly, or were written by a newer pgdm.
+        ConfigError: if they are damaged, were edited wrongly, were written by a newer pgdm, or name
+            a method of a module that is not trusted.
     """
     plain = dict(plain)
     version = plain.pop("format", None)

@@ -38,7 +38,7 @@ class ExperimentCfg:
     pregrasp: PregraspCfg
     """Where an episode starts."""
     method: Annotated[MethodCfg, ChosenBy("name", config_class, tuple(METHODS))]
-    """Rewards, terminations and metrics."""
+    """Rewards, terminations, measures, schedules and settings of the metrics."""
     ablation: AblationCfg
     """What the ablation removes."""
     obs: ObsCfg
@@ -46,7 +46,7 @@ class ExperimentCfg:
     action: ActionCfg
     """How actions become actuator targets."""
     shaping: ShapingCfg
-    """What is added to reward and terminations in training, never in evaluation."""
+    """Changes to reward and discount in training, never in evaluation."""
     reference: ReferenceCfg
     """How the stored motion becomes targets."""
     algo: Annotated[AlgoCfg, ChosenBy("learner", algo_class, tuple(ALGOS))]
@@ -70,7 +70,7 @@ class ExperimentCfg:
     num_threads: int
     """Threads for simulation and learning; 0: all cores."""
     device: str
-    """Where the learner computes: ``cpu`` or ``cuda``."""
+    """Where the learner computes: ``cpu``, ``cuda`` or ``cuda:N``."""
     run_dir: str
     """Folder of the run."""
     resume: str
@@ -84,7 +84,7 @@ class ExperimentCfg:
     """Whether missing assets are an error instead of being fetched."""
 
     def validate(self) -> None:
-        """Check the rules that hold between fields, and the range of each.
+        """Check names, choices and ranges of single fields, and the rules that hold between fields.
 
         Raises:
             ConfigError: at the first broken rule; the message has the values and a remedy.

@@ -37,7 +37,8 @@ class ChosenBy:
         """Return the class for some data.
 
         Raises:
-            ConfigError: if the key is missing, or the data have keys of another class.
+            ConfigError: if the key is missing, its value is unknown or no text, or the data have
+                keys of another class.
         """
         where = _join(path, self.key)
         if self.key not in data:

@@ -18,7 +18,7 @@ _WILD = "*?["
 
 
 def suites(config_dir: str | Path | None = None) -> dict[str, Path]:
-    """Return the suites' files by name; pgdm's file comes before a user's of the same name."""
+    """Return the suites' files by name; pgdm's takes precedence over a user's of equal name."""
     own_last = [f for folder in folders(config_dir) for f in (folder / "suite").glob("*.yaml")]
     found = {file.stem: file for file in reversed(own_last)}
     return dict(sorted(found.items()))

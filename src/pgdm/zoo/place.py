@@ -93,7 +93,7 @@ class Zoo:
         """The entries by name, sorted.
 
         Raises:
-            ZooError: if the index is missing or damaged.
+            ZooError: if the index is missing, damaged or of another format.
         """
         where = f"{self.place.rstrip('/')}/{INDEX}"
         try:
@@ -121,7 +121,8 @@ class Zoo:
 
         Raises:
             UnknownNameError: if there is none of this name.
-            ZooError: if the file is missing, or its SHA-256 is not that of the index.
+            ZooError: if index or file cannot be read, or the file's SHA-256 is not that of the
+                index.
         """
         entry, file = self.entry(name), name + ENDING
         content = self._read(file, MOST_BYTES)

@@ -56,14 +56,15 @@ def add_run(
     """Add the last policy of a finished run to a zoo, in half precision if that is accurate enough.
 
     It is accurate enough if sampled success and error of the rounded policy are within the 95%
-    intervals of the run's own evaluation (Student's t, over its episodes), or change by no more
-    than a single control step could cause. The stored evaluation is that of the stored weights.
+    intervals of the run's own evaluation (Student's t, over its episodes), or differ by no more
+    than one control step's share of success and an error of 1 mm at every step. The stored
+    evaluation is that of the stored weights.
 
     Args:
         run: folder of the run.
         name: name of the entry; an existing entry is replaced.
         zoo: folder of the zoo, created if missing.
-        notify: called with the changes due to rounding.
+        notify: called with notes on assets and on the changes due to rounding.
         progress: called with the progress of the evaluation.
         stop: polled during the evaluation; True ends it, and no entry is made.
 

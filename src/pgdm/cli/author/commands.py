@@ -28,7 +28,10 @@ def make_object(
     ],
     name: Annotated[
         str,
-        typer.Option(metavar="NAME", help="Name of the object: lower-case letters, digits, '_'."),
+        typer.Option(
+            metavar="NAME",
+            help="Name of the object: a lower-case letter, then lower-case letters, digits, '_'.",
+        ),
     ],
     scale: Annotated[
         float | None, typer.Option(help="Metres per unit of the file [1].", metavar="S")
@@ -48,10 +51,18 @@ def make_object(
         ),
     ] = None,
     parts: Annotated[
-        int | None, typer.Option(help="Largest number of convex parts, 1 to 64.", metavar="N")
+        int | None,
+        typer.Option(
+            help="Largest number of convex parts, 1 to 64 [as many as --threshold needs].",
+            metavar="N",
+        ),
     ] = None,
     threshold: Annotated[
-        float, typer.Option(help="Concavity that may remain, 0.01 to 1; lower gives more parts.")
+        float,
+        typer.Option(
+            help="Concavity that may remain, relative to the size, 0.01 to 1; lower gives more "
+            "parts."
+        ),
     ] = 0.05,
     licence: Annotated[
         str, typer.Option(help="Licence of the mesh, recorded with the object.")
@@ -62,8 +73,8 @@ def make_object(
 ) -> None:
     """Make an object from a mesh.
 
-    The mesh is repaired, checked and split into convex parts. The object is weighed, dropped on a
-    table in simulation, and drawn to picture.png in its folder.
+    The mesh is repaired, checked and split into convex parts. The object's mass and inertia are
+    computed; it is dropped on a table in simulation, and drawn to picture.png in its folder.
     """
     own.check_object_name(name, replace)
     with loading():
@@ -83,19 +94,25 @@ def make_object(
 def make_hand(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="MJCF or URDF.", callback=existing)],
     name: Annotated[
-        str, typer.Option(metavar="NAME", help="Name of the hand: lower-case letters, digits, '_'.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Name of the hand: a lower-case letter, then lower-case letters, digits, '_'.",
+        ),
     ],
     fingers: Annotated[
         list[str] | None,
         typer.Option(
-            help="A link of each finger, if pgdm cannot find them: thumb=LINK,index=LINK,...",
+            help="A link or joint of each finger, if pgdm cannot find the fingers: "
+            "thumb=LINK,index=LINK,...",
             metavar="LIST",
         ),
     ] = None,
     reset: Annotated[
         list[str] | None,
         typer.Option(
-            help="Joints in the reset pose, rad or m: JOINT=POSITION,... [zero, or nearest limit].",
+            help="Joints in the reset pose, rad or m: JOINT=POSITION,... [zero, or the limit "
+            "nearest to zero].",
             metavar="LIST",
         ),
     ] = None,
@@ -106,16 +123,23 @@ def make_hand(
     turn: Annotated[
         str,
         typer.Option(
-            help="Rotate the hand about the world's x, y, z, degrees [fingers along y, palm down].",
+            help="Rotate the hand about the world's x, then y, then z axis, degrees; unrotated, "
+            "fingers point along y and the palm down.",
             metavar="X,Y,Z",
         ),
     ] = "0,0,0",
     kp: Annotated[
         float | None,
-        typer.Option(help="Gain of the finger servos, N m/rad [the file's, or 3].", metavar="KP"),
+        typer.Option(
+            help="Gain of all finger and wrist servos, N m/rad [the file's, or 3].", metavar="KP"
+        ),
     ] = None,
     drop_tendons: Annotated[
-        bool, typer.Option("--drop-tendons", help="Leave out tendons that actuators drive.")
+        bool,
+        typer.Option(
+            "--drop-tendons",
+            help="Leave out actuators on tendons; each joint gets a servo instead.",
+        ),
     ] = False,
     root: Annotated[
         Path | None,
@@ -134,8 +158,9 @@ def make_hand(
 ) -> None:
     """Make a hand from MJCF or URDF.
 
-    The hand gets six base joints, a position servo for each joint, points to observe, a reset pose
-    and a mean hand; it is checked and drawn to picture.png in its folder.
+    The hand gets six base joints, a position servo for each joint that is not coupled to another,
+    tracked points, a reset pose and a mean hand; it is checked and drawn to picture.png in its
+    folder.
     """
     shipped = [path.stem for path in (conf_dir() / "hand").glob("*.yaml")]
     own.check_hand_name(name, shipped, replace)
@@ -184,7 +209,8 @@ def make_task(
     origin: Annotated[
         str,
         typer.Option(
-            help="Point whose positions were recorded: com, or mesh (the mesh file's origin)."
+            help="Only --poses: point whose positions were recorded: com (centre of mass), or mesh "
+            "(the mesh file's origin)."
         ),
     ] = "com",
     pregrasp: Annotated[
@@ -204,12 +230,15 @@ def make_task(
         bool, typer.Option("--lift-above-table", help="Raise poses that cut into the table.")
     ] = False,
     settle: Annotated[
-        bool, typer.Option("--settle", help="Shift the motion to where the object comes to rest.")
+        bool,
+        typer.Option(
+            "--settle", help="Shift and turn the motion to start where the object comes to rest."
+        ),
     ] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Replace a task of that id.")] = False,
     offline: Offline = False,
 ) -> None:
-    """Make a task from an object, a hand and a motion.
+    """Make a task from an object, a hand and a motion (--keyframes or --poses).
 
     Train it with pgdm-run task=ID.
     """

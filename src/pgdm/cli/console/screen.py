@@ -108,7 +108,7 @@ def bars(patience_s: float = 0.0) -> Iterator[StepProgress]:
     """Show progress: on a terminal, bars with the remaining time; else a line every few seconds.
 
     Args:
-        patience_s: time before the bars appear.
+        patience_s: on a terminal, time before the bars appear, s.
     """
     if not SCREEN.is_terminal:
         lines = ProgressLines(notify)

@@ -16,7 +16,8 @@ def run_check(file: Path) -> int:
     """Print what a playback holds and which limits it exceeds; return the exit code.
 
     Raises:
-        PlaybackError: if the file is not a playback.
+        ConfigError: if the file's name ends in neither .npz nor .csv.
+        PlaybackError: if the file is damaged or not a playback.
     """
     playback = read(file)
     used = limits.usage(playback.time_s, playback.arm_joints_rad)
@@ -25,7 +26,7 @@ def run_check(file: Path) -> int:
 
 
 def describe(file: Path, playback: Playback, used: limits.Usage) -> None:
-    """Print what a playback holds, how much of the arm's limits it uses, and its violations."""
+    """Print a playback's content, its share of the arm's limits, and its worst violations."""
     say = partial(console().print, soft_wrap=True, markup=False, highlight=False)
     count, hand = len(playback.time_s), len(playback.hand_joints)
     task = playback.facts.get("task", "no task")

@@ -47,13 +47,21 @@ def export_playback(
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="File to write: .npz or .csv.")],
     episodes: Annotated[
-        int, typer.Option(min=1, help="Episodes to choose from; the best is exported.")
+        int,
+        typer.Option(
+            min=1,
+            help="Episodes of which the best is exported; only one is run unless the task is "
+            "randomised or --sampled is given.",
+        ),
     ] = 16,
     sampled: Annotated[
         bool, typer.Option("--sampled", help="Sample actions instead of using the mean action.")
     ] = False,
     best: Annotated[
-        bool, typer.Option("--best", help="Use the run's best checkpoint instead of its last.")
+        bool,
+        typer.Option(
+            "--best", help="Use the run's checkpoint of highest success, if any, not its last."
+        ),
     ] = False,
     base: Annotated[
         str,
@@ -64,15 +72,20 @@ def export_playback(
     ] = "reached",
     speed: Annotated[float, typer.Option(help="Fraction of the simulation's speed.")] = 1.0,
     smooth: Annotated[
-        float, typer.Option(help="Standard deviation of the commands' Gaussian smoothing, s.")
+        float,
+        typer.Option(help="Standard deviation of the Gaussian smoothing, s of simulated time."),
     ] = 0.04,
     hold: Annotated[float, typer.Option(min=0, help="How long to hold the last command, s.")] = 1.0,
-    rate: Annotated[float, typer.Option(min=10, max=1000, help="Samples per second.")] = 100.0,
+    rate: Annotated[
+        float,
+        typer.Option(min=10, max=1000, help="Samples per second, rounded to 1000/n, n whole."),
+    ] = 100.0,
     arm: Annotated[
         str | None,
         typer.Option(
             metavar="'X Y TURN'",
-            help="Arm's base in the world: x, y, m, and turn (yaw), degrees [the hand's default].",
+            help="Arm's base in the world: x and y in m, turn (yaw) in degrees; hands other than "
+            "adroit and dmanus have no default.",
             callback=_numbers(3, "x y turn"),
         ),
     ] = None,
@@ -83,8 +96,8 @@ def export_playback(
         str | None,
         typer.Option(
             metavar="'X Y Z R P Y'",
-            help="Hand's mount body in the flange's frame: m, then roll, pitch, yaw, degrees "
-            "[the hand's default].",
+            help="Hand's mount body in the flange's frame: x, y, z in m, then roll, pitch, yaw in "
+            "degrees; hands other than adroit and dmanus have no default.",
             callback=_numbers(6, "x y z roll pitch yaw"),
         ),
     ] = None,
@@ -92,7 +105,10 @@ def export_playback(
         bool, typer.Option("--force", help="Write the file even if the arm cannot play it.")
     ] = False,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the episodes; by default the run's.")
+        int | None,
+        typer.Option(
+            min=0, help="Seed of action noise and task randomisation; by default the run's."
+        ),
     ] = None,
     offline: Offline = False,
 ) -> None:
@@ -132,13 +148,15 @@ def simulate_playback(
             min=1, help="Random objects to try; without effect unless the task is randomised."
         ),
     ] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the objects.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random objects.")] = 0,
     video: Video = None,
     offline: Offline = False,
 ) -> None:
     """Play a file open-loop on arm and hand in simulation, and print how many objects are held.
 
-    Arm and hand follow the commands with joint controllers; the policy corrects nothing.
+    Arm and hand follow the commands with joint controllers; the policy corrects nothing. An object
+    is held if it ends more than 2 cm above its start, and rises at least half as far as in the
+    exported episode.
     """
     with loading():
         from pgdm.cli.deploy.simulate import SimulateRequest, run_simulate
@@ -153,12 +171,18 @@ def study_playbacks(
     ],
     task: Annotated[str, typer.Option(help="Task whose runs are played.")] = "dmanus-sim2real",
     speed: Annotated[float, typer.Option(help="Fraction of the simulation's speed.")] = 0.6,
-    boxes: Annotated[int, typer.Option(min=1, help="Objects to try for each run.")] = 100,
+    boxes: Annotated[
+        int,
+        typer.Option(
+            min=1, help="Random objects for each run; without effect unless the task is randomised."
+        ),
+    ] = 100,
     offline: Offline = False,
 ) -> None:
     """Export and simulate all runs of a task, in place of the paper's real-world experiment.
 
-    Each playback is written into its run's folder, and the table also as playbacks.json in DIR.
+    A playback that the arm can play is written to its run's folder as playback.npz; the results of
+    all runs are written to playbacks.json in DIR.
     """
     with loading():
         from pgdm.cli.deploy.study import run_study
@@ -181,7 +205,8 @@ def play_playback(
 ) -> None:
     """Play a file on a Franka arm. Without --move nothing moves.
 
-    The arm first moves slowly to the start. Ctrl-C brings it to rest. The hand is not moved.
+    The arm first moves slowly to the start; a single Ctrl-C takes effect only once it is there.
+    During the playback Ctrl-C brings the arm to rest. The hand is not moved.
     """
     if move and robot is None:
         raise ConfigError("--move needs --robot HOST")

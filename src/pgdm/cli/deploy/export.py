@@ -27,7 +27,7 @@ class ExportRequest:
     run: Path
     out: Path
     episodes: int
-    """Number of episodes to choose from."""
+    """Number of episodes to choose from, if actions are sampled or the task is randomised."""
     sampled: bool
     """Whether actions are sampled; otherwise they are the policy's mean."""
     best: bool
@@ -40,7 +40,7 @@ class ExportRequest:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the arm is, see `Setup`."""
+    """Where the arm stands and how the hand is mounted, see `Setup`."""
 
     arm_at: Floats | None = None
     """None: the default of the hand; likewise for ``mount``."""
@@ -51,9 +51,11 @@ class Place:
 def run_export(request: ExportRequest, cfg: ConvertCfg, place: Place) -> int:
     """Write the playback and print how much of the arm's limits it uses; return the exit code.
 
+    The code is 1 if the arm cannot play it, even if it is written anyway.
+
     Raises:
-        PgdmError: if the run is damaged, its policy loses the object in all episodes, or a file
-            cannot be fetched or written.
+        PgdmError: if a setting is wrong, the run is damaged, its policy loses the object in all
+            episodes, or a file cannot be fetched or written.
     """
     begun = time.monotonic()
     done = converted(request, cfg, place)
@@ -105,7 +107,7 @@ def converted(request: ExportRequest, cfg: ConvertCfg, place: Place) -> Converte
             "checkpoint": Path(trained.name).name,
             "frames": trained.frames,
             "asset_source": builder.scene.asset_source,
-            "episodes": f"best of {len(rollouts)} that were not terminated early, of {count}",
+            "episodes": f"best of {len(rollouts)} that did not end early, of {count}",
             "metrics": {k: v for k, v in chosen.metrics.items() if "/" not in k and v == v},
             "variation": chosen.variation,
             "start_qpos": chosen.qpos[0].tolist(),

@@ -18,7 +18,8 @@ def run_play(file: Path, robot: str | None, move: bool, realtime: bool) -> int:
     """Check a playback, connect, and move the arm if asked to; return the exit code.
 
     Raises:
-        PgdmError: if the file is not a playback or exceeds the arm's limits, or the arm rejects it.
+        PgdmError: if the file is not a playback or exceeds the arm's limits, or the arm cannot be
+            reached, refuses to move or lags too far behind.
     """
     playback = read(file)
     check_playable(playback)
@@ -33,7 +34,7 @@ def run_play(file: Path, robot: str | None, move: bool, realtime: bool) -> int:
         print("dry run: nothing was moved (--move moves the arm)")
         return 0
     with StopRequest() as stop:
-        notify("moving to the start, slowly; Ctrl-C stops the arm")
+        notify("moving to the start, slowly; a single Ctrl-C takes effect once the arm is there")
         player.approach(playback)
         if stop():
             return stop.exit_code

@@ -36,7 +36,7 @@ class SimulateRequest:
 
 
 def run_simulate(request: SimulateRequest) -> int:
-    """Play a playback open-loop, print the outcome and film the first object.
+    """Play a playback open-loop, print the outcome and, if asked to, film the first object.
 
     Raises:
         PgdmError: if the file is not a playback or does not fit its task, assets cannot be fetched,

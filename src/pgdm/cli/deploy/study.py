@@ -24,7 +24,8 @@ def run_study(folder: Path, task: str, speed: float, boxes: int, offline: bool) 
     """Export and simulate all runs of a task below a folder; print and store a table.
 
     Raises:
-        ConfigError: if there is no such run.
+        ConfigError: if there is no such run, the settings of a run are damaged, or ``speed`` is not
+            above 0.
     """
     cfg = ConvertCfg(speed=speed)
     cfg.check()

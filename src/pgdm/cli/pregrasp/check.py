@@ -125,10 +125,10 @@ def _rows(
 
 
 def _stored(scene: Scene, motion: Motion, sources: Sequence[str]) -> list[_Checked]:
-    """Return a task's pre-grasps for this hand; the user's replace the library's of that source.
+    """Return a task's pre-grasps for this hand; the user's replace the library's of equal source.
 
     Raises:
-        ConfigError: if one of the sources is missing.
+        ConfigError: if one of the sources is missing, or there is no pre-grasp at all.
     """
     task, hand, nq = scene.task.id, scene.hand.name, scene.model.nq
     fitting = {n: start.qpos for n, start in motion.starts.items() if start.qpos.shape == (nq,)}
@@ -166,6 +166,8 @@ def _own(own: Pregrasp, path: Path | None) -> _Checked:
 
 def _whose(file: Path, own: Pregrasp, hand: str | None) -> tuple[str, str]:
     """Return task and hand of a file, from its note or else from the names of its folders.
+
+    A given ``hand`` takes precedence.
 
     Raises:
         ConfigError: if neither gives a valid task and hand.

@@ -26,7 +26,10 @@ app = typer.Typer(help="Make pre-grasps, and check them.", no_args_is_help=True)
 
 _Reach = Annotated[
     bool,
-    typer.Option("--reach/--no-reach", help="Plan the reach, and start episodes where it ends."),
+    typer.Option(
+        "--reach/--no-reach",
+        help="Plan the reach; if it succeeds, episodes start where it ends, else at the pre-grasp.",
+    ),
 ]
 
 
@@ -36,12 +39,17 @@ def reach(
     hand: Hand = None,
     source: Source = "mined",
     replace: Annotated[
-        bool, typer.Option("--replace", help="Plan again even if a plan is published or stored.")
+        bool,
+        typer.Option(
+            "--replace",
+            help="Plan again even if a plan is published or stored; a stored plan from the same "
+            "search and seed is kept.",
+        ),
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     offline: Offline = False,
 ) -> None:
-    """Plan and store the reach from reset pose to pre-grasp."""
+    """Plan the reach from reset pose to pre-grasp; store it if it succeeds."""
     with loading():
         from pgdm.cli.pregrasp.reach import Request, run
 
@@ -54,7 +62,7 @@ def check(
         list[str],
         typer.Argument(
             metavar="TASK|FILE...",
-            help="Tasks, suites, or pre-grasp files.",
+            help="Tasks, suites, patterns such as 'dhand-*', or pre-grasp files (.npz).",
             callback=tasks_or_files,
             autocompletion=complete_tasks,
         ),
@@ -99,13 +107,17 @@ def mocap(
         typer.Option(
             metavar="FILE",
             help="Human hand joints (.npz, .json, .csv); by default the library's expert, else "
-            "points of the task's own hand at its mined pre-grasp.",
+            "points of the task's own hand at its stored pre-grasp.",
             callback=existing,
         ),
     ] = None,
     frame: Annotated[
         int | None,
-        typer.Option(min=0, help="Frame of the recording; by default the last before contact."),
+        typer.Option(
+            min=0,
+            help="Frame of the recording; by default the last before contact in a FILE, the first "
+            "in the library's expert.",
+        ),
     ] = None,
     reach: _Reach = True,
     image: Image = None,
@@ -133,7 +145,8 @@ def teleop(
         int | None,
         typer.Option(
             min=0,
-            help="Index of the demonstration, from 0 [that with the object nearest to the task's].",
+            help="Index of the demonstration, from 0; by default the usable demonstration whose "
+            "object is nearest to the task's.",
         ),
     ] = None,
     reach: _Reach = True,
@@ -142,7 +155,7 @@ def teleop(
 ) -> None:
     """Cut a pre-grasp from a demonstration (pregrasp=teleop).
 
-    The pre-grasp is the pose just before the hand grasps the object.
+    The pre-grasp is the pose just before the hand takes hold: touches something for 0.2 s or more.
     """
     with loading():
         from pgdm.cli.pregrasp.teleop import run
@@ -169,7 +182,8 @@ def label(
             "--from",
             metavar="POSE",
             help="Pose to start from: mined, planned, learned, mocap, teleop, labeled, mean, open, "
-            "none, or a pre-grasp's FILE; by default your draft, else the best one available.",
+            "none (reset pose), or a pre-grasp's FILE; by default your draft, else the first of "
+            "labeled, planned, mined, mocap and none that exists.",
         ),
     ] = None,
     port: Annotated[
@@ -206,10 +220,17 @@ def train(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the weights to this file [in your own folder]."),
+        typer.Option(
+            metavar="FILE",
+            help="Write the weights to this file; by default to the file that pregrasp=learned "
+            "reads.",
+        ),
     ] = None,
 ) -> None:
-    """Train the predictor on the pre-grasps of the library."""
+    """Train a predictor on the library's mined pre-grasps of a hand and on your own.
+
+    Your own are those made by label, mocap and teleop.
+    """
     with loading():
         from pgdm.cli.pregrasp.train import run
 
@@ -228,7 +249,7 @@ def predict(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Weights from 'pgdm pregrasp train --out FILE'.",
+            help="Weights from 'pgdm pregrasp train --out FILE' [those trained without --out].",
             callback=existing,
         ),
     ] = None,

@@ -37,7 +37,9 @@ class Request:
 
 
 def run(request: Request) -> int:
-    """Plan and store reaches and print a table; return the exit code, 1 if any task failed.
+    """Plan and store reaches and print a table; return the exit code.
+
+    The code is 1 if any task failed, 130 after Ctrl-C.
 
     Raises:
         PgdmError: if a name is unknown; failures of single tasks are only printed.
@@ -60,7 +62,8 @@ def run(request: Request) -> int:
         code = FAILED if failed else 0
     except KeyboardInterrupt:
         print(
-            "stopped; the plans in the table are stored, and the same command plans the rest",
+            "stopped; plans that the table shows as stored are kept; the same command plans the "
+            "rest",
             file=sys.stderr,
         )
         code = INTERRUPTED

@@ -15,7 +15,7 @@ from pgdm.sim.scene import Scene
 
 
 def planned(pregrasp: Pregrasp, opened: Opened, reach: bool, progress: StepProgress) -> Pregrasp:
-    """Return a pre-grasp, with its reach plan if ``reach`` is set."""
+    """Return a pre-grasp; if ``reach`` is set, with its reach plan, unless that is rejected."""
     if not reach:
         return pregrasp
     count = threads(opened.cfg)
@@ -39,7 +39,7 @@ def report(path: Path, scene: Scene) -> None:
 
 
 def report_with_reach(path: Path, image: Path | None, pregrasp: Pregrasp, scene: Scene) -> None:
-    """Print a pre-grasp's reach and where it is stored; draw both if ``image`` is given."""
+    """Print a pre-grasp's reach and file; draw its pose and reach's end if ``image`` is given."""
     reach = pregrasp.note.get("reach")
     if reach:
         print(

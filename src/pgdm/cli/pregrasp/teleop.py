@@ -21,7 +21,7 @@ def run(
     """Cut and store a pre-grasp from a demonstration, and print what was found.
 
     Raises:
-        PgdmError: the task or file is unknown or damaged, or the hand never grasps the object.
+        PgdmError: the task or file is unknown or damaged, or no usable pre-grasp can be cut.
     """
     cfg = composed(task, None, offline=offline)
     teleop.layout_of(task)  # an unsupported task is reported before anything takes time
@@ -43,7 +43,8 @@ def run(
     print(
         f"demonstration {note['demonstration']} (of {count}): takes hold at step "
         f"{note['takes_hold_at']}, cut at step {note['step']}; its object was "
-        f"{note['object_shift_mm']} mm from the task's; slides {note['beyond_range_mm']} mm beyond "
-        f"their ranges; palm error {note['palm_error_mm']} mm; penetration {note['depth_mm']} mm"
+        f"{note['object_shift_mm']} mm from the task's; base slides would exceed their ranges by "
+        f"{note['beyond_range_mm']} mm; palm error {note['palm_error_mm']} mm; penetration "
+        f"{note['depth_mm']} mm"
     )
     report_with_reach(path, image, pregrasp, scene)

@@ -1,4 +1,4 @@
-"""``pgdm pregrasp train``: train a predictor of pre-grasps on all pre-grasps of a hand."""
+"""``pgdm pregrasp train``: train a predictor on a hand's mined pre-grasps and the user's."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def _describe(predictor: Predictor, poses: int) -> list[str]:
 
 
 def _collect(hand: str, progress: StepProgress) -> list[tuple[Scene, Example]]:
-    """Return every usable pre-grasp of a hand, with its scene.
+    """Return a hand's mined pre-grasps and the user's, if usable, each with its scene.
 
     Raises:
         LibraryError: there is none.
