@@ -170,7 +170,7 @@ def test_fingers_without_names_are_found_by_geometry_or_asked_for() -> None:
     few = {name: link for name, link in chosen.items() if name != "ring"}
     with pytest.raises(ConfigError, match=r"--fingers must name every finger, .* lacks 'chain1_2'"):
         author_hand(request(Path("hand.urdf"), name="x", fingers=few))
-    with pytest.raises(ConfigError, match=r"index=nolink does not identify .* 'chain2_2'"):
+    with pytest.raises(ConfigError, match=r"index=nolink must name a link or joint .* 'chain2_2'"):
         author_hand(request(Path("hand.urdf"), name="x", fingers={"index": "nolink"}))
     made = author_hand(request(Path("hand.urdf"), name="asked", fingers=chosen))
     assert made.anatomy.found_by == "--fingers"

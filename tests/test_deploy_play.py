@@ -81,7 +81,9 @@ def test_a_playback_moves_a_simulated_arm(
 
     player = Player(arm, realtime=False)
     np.testing.assert_allclose(player.joints, wanted.arm_joints_rad[-1], atol=0.05)
-    player.approach(wanted)
+    assert not player.approach(wanted, stop=lambda: True)  # stopped on the way
+    assert player.joints[0] > wanted.arm_joints_rad[0, 0] + 0.1
+    assert player.approach(wanted)
     answers = iter([False] * 100)
     stopped = player.play(wanted, stop=lambda: next(answers, True))
     assert not stopped.whole and 0.1 < stopped.time_s < 2.5

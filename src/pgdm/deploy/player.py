@@ -22,6 +22,7 @@ MOST_LAG_RAD = 0.2
 STIFFNESS = np.array([600.0, 600.0, 600.0, 600.0, 250.0, 150.0, 50.0])  # N m/rad, Franka's example
 
 _PERIOD_S = 0.004
+_POLL_S = 0.05
 _APPROACH = 0.1  # share of the arm's speed, acceleration and jerk on the way to the start
 _NEAR_RAD = 0.1  # largest distance of a joint from the start at which the playback may begin
 
@@ -86,23 +87,38 @@ class Player:
         """The arm's current joint positions, (7,) rad."""
         return np.array([float(q) for q in self._robot.current_joint_state.position])
 
-    def approach(self, playback: Playback) -> None:
+    def approach(self, playback: Playback, stop: Callable[[], bool] = lambda: False) -> bool:
         """Move slowly to the start of a playback, in a straight line in joint space.
+
+        Args:
+            playback: the playback.
+            stop: polled every 50 ms; True brings the arm to rest.
+
+        Returns:
+            Whether the arm is at the start.
 
         Raises:
             RobotError: if the arm refuses, or stops elsewhere.
         """
-        franky = self._franky
+        franky, robot = self._franky, self._robot
         target = franky.JointWaypoint(playback.arm_joints_rad[0].tolist())
-        self._guarded(
-            lambda: self._robot.move(
-                franky.JointWaypointMotion([target], relative_dynamics_factor=_APPROACH)
-            )
-        )
+        motion = franky.JointWaypointMotion([target], relative_dynamics_factor=_APPROACH)
+
+        def follow() -> bool:
+            robot.move(motion, asynchronous=True)
+            while not robot.join_motion(_POLL_S):
+                if stop():
+                    robot.move(franky.JointStopMotion())
+                    return False
+            return True
+
+        if not self._guarded(follow):
+            return False
         away = np.abs(self.joints - playback.arm_joints_rad[0])
         if away.max() > _NEAR_RAD:
             joint = JOINTS[int(away.argmax())]
             raise RobotError(f"{joint} stopped {away.max():.2f} rad away from the playback's start")
+        return True
 
     def play(
         self,

@@ -205,8 +205,8 @@ def play_playback(
 ) -> None:
     """Play a file on a Franka arm. Without --move nothing moves.
 
-    The arm first moves slowly to the start; a single Ctrl-C takes effect only once it is there.
-    During the playback Ctrl-C brings the arm to rest. The hand is not moved.
+    The arm first moves slowly to the start. Ctrl-C brings it to rest at any time. The hand is not
+    moved.
     """
     if move and robot is None:
         raise ConfigError("--move needs --robot HOST")

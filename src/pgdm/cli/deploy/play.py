@@ -34,9 +34,8 @@ def run_play(file: Path, robot: str | None, move: bool, realtime: bool) -> int:
         print("dry run: nothing was moved (--move moves the arm)")
         return 0
     with StopRequest() as stop:
-        notify("moving to the start, slowly; a single Ctrl-C takes effect once the arm is there")
-        player.approach(playback)
-        if stop():
+        notify("moving to the start, slowly; Ctrl-C stops the arm")
+        if not player.approach(playback, stop):
             return stop.exit_code
         with bars() as progress:
             played = player.play(playback, stop, partial(progress, "playing"))
