@@ -149,8 +149,9 @@ def _stored(scene: Scene, motion: Motion, sources: Sequence[str]) -> list[_Check
         found["mined"] = dataclasses.replace(found["mined"], plan=found["planned"].plan)
     missing = [source for source in sources if source not in found]
     if missing or not found:
+        wanted = f"pre-grasp {' or '.join(missing)}".rstrip()
         raise ConfigError(
-            f"task '{task}' has no pre-grasp {' or '.join(missing)} for hand '{hand}'; it has: "
+            f"task '{task}' has no {wanted} for hand '{hand}'; it has: "
             f"{', '.join(found) or 'none'}. 'pgdm pregrasp --help' shows how to make one"
         )
     return [found[name] for name in (sources or found)]
