@@ -42,10 +42,11 @@ def description(policy: TrainedPolicy, builder: EnvBuilder) -> dict[str, Any]:
       (m, rad). If there is a ``wrist``, the targets of the first ``len(low)`` joints are instead
       ``clip(path[min(t + lead_steps, T-1)] + largest * action, low, high)``;
     - ``actuators``: names, in the order of MuJoCo's ``ctrl``;
-    - ``control``: physics steps of ``timestep_s`` per control step, and how many joints, first in
-      ``qvel``, get ``qfrc_bias`` as applied force at the start of each control step;
-    - ``start``: the start state; ``episode``: the exemplar motion, and the object errors up to
-      which a step is a success and from which the object is lost.
+    - ``control``: ``timestep_s`` of a physics step, and ``substeps`` per control step; during a
+      control step the first ``compensated_joints`` joints of ``qvel`` get as applied force the
+      ``qfrc_bias`` of the step's start;
+    - ``start``: the start state; ``episode``: the exemplar motion, the object errors up to
+      which a step is a success and from which the object is lost, and the terminations' names.
     """
     scene, mdp = builder.scene, builder.mdp
     index, model = scene.index, scene.model

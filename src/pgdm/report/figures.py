@@ -203,7 +203,7 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
 
 
 def line_axes(panels: dict[str, tuple[float, float] | None]) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel below another for each label; its y-range may be given."""
+    """Return a figure with panels one below the other: label to y-range, None for automatic."""
     figure = _figure(2.2 * len(panels) + 0.6)
     drawn = list(figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0])
     for axes, (label, extent) in zip(drawn, panels.items(), strict=True):
