@@ -129,10 +129,10 @@ class ArmIk:
     def follow(self, pos: np.ndarray, quat: np.ndarray, seed: int = 0) -> ArmPath:
         """Return joints within the limits along a path of the hand's mount body.
 
-        The redundant arm can start in many configurations. Several are compared on
-        samples of the whole path: the smallest error wins; among equals (to 1 mm), distance from
-        the limits and absence of jumps decide. Where a pose cannot be reached, the flange comes as
-        close to it as possible.
+        The redundant arm can start in many configurations. Several are compared on samples
+        of the whole path: the smallest error wins; among equals (to 1 mm), distance from the limits
+        and absence of jumps decide. Where a pose cannot be reached, the flange comes as close to it
+        as possible.
 
         Args:
             pos: positions (K, 3) m, world frame.

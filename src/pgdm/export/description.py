@@ -38,8 +38,9 @@ def description(policy: TrainedPolicy, builder: EnvBuilder) -> dict[str, Any]:
       ``of``, the joints, geoms or bodies that it describes;
     - ``observation_by_step``: (T, K) the last K numbers of the observation at each t;
     - ``points``, ``object``: geoms of the hand's points, and the tracked body;
-    - ``action``: for the hand's driven ``joints``, in [-1, 1]; ``target = middle + half * action``
-      (m, rad). If there is a ``wrist``, the targets of the first ``len(low)`` joints are instead
+    - ``action``: for the hand's driven ``joints``, first clipped to [-1, 1]; then
+      ``target = middle + half * action`` (m, rad). If there is a ``wrist``, the targets of the
+      first ``len(low)`` joints are instead
       ``clip(path[min(t + lead_steps, T-1)] + largest * action, low, high)``;
     - ``actuators``: names, in the order of MuJoCo's ``ctrl``;
     - ``control``: ``timestep_s`` of a physics step, and ``substeps`` per control step; during a
@@ -91,7 +92,7 @@ def _parts(layout: str, builder: EnvBuilder, joints: list[str]) -> list[_Part]:
     index, model = builder.scene.index, builder.scene.model
     tracked = model.body(index.object_body).name
     points = [model.geom(i).name for i in index.point_geoms]
-    time = ("time", 8, "sin and cos of 1, 4, 6 and 8 t/T", ())
+    time = ("time", 8, "first sin, then cos, of 1, 4, 6 and 8 times t/T", ())
     if layout == "paper":
         tips = [points[i] for i in index.fingertips]
         return [

@@ -43,8 +43,8 @@ class Average:
     rotation: Estimate
     same: dict[str, float]
     """The paper's average over the same tasks: ``success`` and ``com_error``; NaN unless the row is
-    PGDM with pre-grasps, each task's own hand and no ablation: the paper's values by task are for
-    that."""
+    PGDM with pre-grasps, each task's own hand and no ablation: the paper has values by task only
+    for that."""
     paper: dict[str, float] = field(default_factory=dict)
     """The paper's own average: ``success``, ``com_error`` and, if stated, ``ori_error`` and
     ``tasks``; empty if the paper has no such row, as for another method's ablation or
@@ -81,7 +81,7 @@ class Improvement(NamedTuple):
 
 
 def by_source(results: Results) -> list[Average]:
-    """Return Table I: rows by pre-grasp source, for each setting that is ``plain``."""
+    """Return Table I: rows by pre-grasp source, for each setting that is `Setting.plain`."""
     rows = []
     for setting in results.settings:
         if setting.plain:

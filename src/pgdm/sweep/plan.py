@@ -35,7 +35,7 @@ class SweepCfg:
     max_attempts: int
     """How many times a job is tried per start of the sweep before it counts as failed."""
     detach: bool
-    """Run in the background, and return immediately."""
+    """Run in the background, and return as soon as the sweep runs there."""
     dry_run: bool
     """Print the plan, and start nothing."""
     most_jobs: int
