@@ -202,5 +202,5 @@ def test_an_arm_that_rests_carries_the_hand(panda: Path, scene: Scene) -> None:
     assert np.abs(outcome.height_m).max() < 0.02
     with pytest.raises(PlaybackError, match="start_qpos is not a list of 22 numbers"):
         start_of(replace(playback, facts={"start_qpos": [1.0, None]}), on_arm, 16)
-    with pytest.raises(PlaybackError, match="its hand_joints are a, b"):
+    with pytest.raises(PlaybackError, match="hand_joints are a, b"):
         start_of(replace(playback, hand_joints=("a", "b")), on_arm, 16)

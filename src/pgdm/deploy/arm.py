@@ -71,7 +71,10 @@ class Setup:
         place, mount = arm_at or PLACES.get(hand), mount or MOUNTS.get(hand)
         if place is None or mount is None:
             known = " and ".join(MOUNTS)
-            raise ConfigError(f"'{hand}' has no default place ({known} have): give --arm, --mount")
+            raise ConfigError(
+                f"'{hand}' has no default place and mount (only {known} have): "
+                "give --arm and --mount"
+            )
         setup = cls(tuple(place), table_height_m, tuple(mount))
         setup.check()
         return setup
@@ -126,8 +129,10 @@ class ArmIk:
     def follow(self, pos: np.ndarray, quat: np.ndarray, seed: int = 0) -> ArmPath:
         """Return joints within the limits along a path of the hand's mount body.
 
-        The redundant arm can start in many configurations. Several are compared over the whole
-        path: the smallest error wins; among equals (to 1 mm), the distance from the limits decides.
+        The redundant arm can start in many configurations. Several are compared on samples
+        of the whole path: the smallest error wins; among equals (to 1 mm), distance from the limits
+        and absence of jumps decide. Where a pose cannot be reached, the flange comes as close to it
+        as possible.
 
         Args:
             pos: positions (K, 3) m, world frame.
@@ -149,7 +154,11 @@ class ArmIk:
         return self._arm.inverse() @ mount @ self._mount.inverse()
 
     def _merit(self, path: ArmPath) -> tuple[float, float]:
-        """Return a path's merit: minus its largest error to 1 mm; room to limits less jumps."""
+        """Return a path's merit, a pair compared in order.
+
+        First minus its largest error, m, rounded to 1 mm; 1 rad counts as 0.1 m. Then the least
+        distance from a limit, at most 0.3 rad, minus the excess of the largest jump over 0.3 rad.
+        """
         low, high = POSITION_RAD.T
         room = float(np.minimum(path.joints - low, high - path.joints).min())
         miss = max(path.position_error_m.max(), 0.1 * path.rotation_error_rad.max())

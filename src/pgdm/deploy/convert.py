@@ -36,7 +36,7 @@ class ConvertCfg:
     hold_s: float = 1.0
     """How long the last command is held, s."""
     rate_hz: float = 100.0
-    """Samples per second of the playback."""
+    """Samples per second of the playback; rounded, so that 1 kHz is a whole multiple of it."""
     speed: float = 1.0
     """1: as fast as in simulation; 0.5: half as fast."""
 
@@ -66,7 +66,7 @@ class Converted:
 
     @property
     def unreached(self) -> str | None:
-        """Where the arm cannot follow the hand, as a sentence."""
+        """Where the arm cannot follow the hand, as a sentence; None if it can everywhere."""
         miss, turn = self.path.position_error_m, self.path.rotation_error_rad
         bad = (miss > REACH_M) | (turn > REACH_RAD)
         if not bad.any():
@@ -87,7 +87,8 @@ def convert(
 
     The simulation holds a command for a control step. The playback has a smooth curve instead: the
     piecewise constant commands, preceded by the hand's start pose and followed by the last command,
-    are convolved with a Gaussian of standard deviation ``cfg.smooth_s``.
+    are convolved with a Gaussian of standard deviation ``cfg.smooth_s``. If ``cfg.base`` is
+    ``reached``, the positions that the base reached take the place of its commands.
 
     Args:
         rollout: the rollout.

@@ -11,7 +11,7 @@ JOINTS = tuple(f"joint{i}" for i in range(1, 8))
 """Names of the arm's joints, in the model and in playbacks."""
 
 # Joints 1 to 7, from Franka's documentation of the control parameters ("Necessary conditions for
-# joint trajectories"), as are the position limits in the arm's model.
+# joint trajectories"). The position limits in the arm's model are the same.
 POSITION_RAD = np.array(
     [
         [-2.8973, 2.8973],

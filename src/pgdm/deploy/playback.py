@@ -26,7 +26,7 @@ _MOST_RATE_HZ = 1000.0
 
 
 class PlaybackError(PgdmError):
-    """A file is damaged, or is not a playback."""
+    """A file is missing, damaged or not a playback, or a playback does not fit its task."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _as_csv(playback: Playback) -> str:
 def _from_csv(text: str) -> dict[str, Any]:
     lines = text.splitlines()
     if len(lines) < 3 or lines[0] != f"# {FORMAT}" or not lines[1].startswith("# "):
-        raise ValueError(f"its first line must be '# {FORMAT}', the second '# ' and its facts")
+        raise ValueError(f"its first line must be '# {FORMAT}', the second '# ' and a JSON object")
     names = lines[2].split(",")
     if len(lines) - 3 > MOST_SAMPLES:
         raise ValueError(f"{len(lines) - 3} samples, more than the {MOST_SAMPLES} allowed")

@@ -46,13 +46,14 @@ def check_playable(playback: Playback) -> None:
     """Check a playback against the limits of the arm.
 
     Raises:
-        ConfigError: if it exceeds a limit; the message names the first violation.
+        ConfigError: if it exceeds a limit; the message names one violation.
     """
     used = usage(playback.time_s, playback.arm_joints_rad)
     if used.violations:
         raise ConfigError(
             f"the arm cannot play this: {used.violations[0].described}; 'pgdm deploy check' lists "
-            "all violations, 'pgdm deploy export' has --speed"
+            "the worst violation by each joint of each limit; 'pgdm deploy export --speed 0.5' "
+            "makes a slower playback"
         )
 
 

@@ -24,7 +24,7 @@ class Rollout:
     dt_s: float
     metrics: dict[str, float]
     variation: dict[str, float]
-    """Friction, half-width (m) and mass (kg) of a randomised object."""
+    """Friction, half-width (m) and mass (kg) of a randomised object; empty for other objects."""
 
 
 def roll_out(
@@ -67,8 +67,9 @@ def roll_out(
     whole = np.flatnonzero(alive)
     if not len(whole):
         raise RunError(
-            f"the policy loses the object before the end of the motion in all {env.num_envs} "
-            "episodes: there is nothing to play; train longer, or roll out more --episodes"
+            f"in all {env.num_envs} episodes the policy loses the object, or the simulation "
+            "diverges, before the end of the motion: there is nothing to play; train longer, or "
+            "roll out more --episodes"
         )
     columns = {
         key: np.stack([getattr(state, key).numpy() for state in states], 1)

@@ -26,7 +26,7 @@ from pgdm.sim.scene import HandCfg, Scene, SceneIndex, TaskCfg
 # Stiffness of Franka's joint impedance controller in Franka's examples.
 STIFFNESS = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)  # N m/rad
 LIFTED_M = 0.02
-"""Height above its start from which an object counts as lifted."""
+"""An object counts as lifted if it is more than this above its start."""
 
 _TIMESTEP_S, _SUBSTEPS = 0.002, 2
 _SCENE = "scene of arm and hand"
@@ -40,7 +40,7 @@ class Outcome:
     height_m: np.ndarray  # (S, K) of the centre of mass above its start; -inf once diverged
     expected_m: float
     """Height of the object above its start at the end of the rollout, m."""
-    arm_error_rad: np.ndarray  # (7,) largest difference of command and joint in all simulations
+    arm_error_rad: np.ndarray  # (7,) largest |command - joint| in all simulations not diverged
     diverged: np.ndarray  # (K,) bool
     qpos: np.ndarray  # (S, nq) of the first simulation
 
@@ -59,8 +59,8 @@ class Outcome:
 def arm_scene(library: Library, cfg: ExperimentCfg, arm_file: Path, setup: Setup) -> Scene:
     """Compile the scene of a run's task with the hand at the flange of the arm.
 
-    The arm's joints replace the six base joints. They and the fingers follow position commands. The
-    arm compensates the weight of arm and hand, as Franka's controller does.
+    The arm's joints replace the six base joints. All joints of arm and hand follow position
+    commands. The arm compensates the weight of arm and hand, as Franka's controller does.
 
     Raises:
         SceneError: if a file is damaged, or the scene does not compile.
@@ -148,7 +148,9 @@ def _index(
 
 
 def start_of(playback: Playback, scene: Scene, num_hand_joints: int) -> np.ndarray:
-    """Return the qpos (nq,) in which a playback begins: its first commands, the object at rest.
+    """Return the qpos (nq,) in which a playback begins.
+
+    Arm and hand are at its first commands, the object where the rollout started.
 
     Args:
         playback: the playback.
@@ -156,19 +158,22 @@ def start_of(playback: Playback, scene: Scene, num_hand_joints: int) -> np.ndarr
         num_hand_joints: number of joints of the hand in the task, base joints included.
 
     Raises:
-        PlaybackError: if its facts do not say where the object is, or do not fit the scene.
+        PlaybackError: if the playback's facts do not say where the object is, or its facts or hand
+            joints do not fit the scene.
     """
     stored = playback.facts.get("start_qpos")
     stored = stored if isinstance(stored, list) else []
     width = num_hand_joints + scene.model.nq - scene.model.nu
     numbers = all(type(x) in (int, float) for x in stored)
     if not numbers or len(stored) != width or not np.isfinite(stored).all():
-        raise PlaybackError(f"its start_qpos is not a list of {width} numbers, as this task needs")
+        raise PlaybackError(
+            f"the playback's start_qpos is not a list of {width} finite numbers, as this task needs"
+        )
     names = tuple(scene.model.joint(i).name.rpartition("/")[2] for i in range(scene.model.nu))
     if names[len(JOINTS) :] != playback.hand_joints:
         raise PlaybackError(
-            f"its hand_joints are {', '.join(playback.hand_joints)[:80]}; the hand's are "
-            f"{', '.join(names[len(JOINTS) :])}"
+            f"the playback's hand_joints are {', '.join(playback.hand_joints)[:80]}; this "
+            f"hand's are {', '.join(names[len(JOINTS) :])}"
         )
     return np.concatenate(
         (playback.arm_joints_rad[0], playback.hand_joints_rad[0], stored[num_hand_joints:])

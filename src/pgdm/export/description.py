@@ -38,14 +38,16 @@ def description(policy: TrainedPolicy, builder: EnvBuilder) -> dict[str, Any]:
       ``of``, the joints, geoms or bodies that it describes;
     - ``observation_by_step``: (T, K) the last K numbers of the observation at each t;
     - ``points``, ``object``: geoms of the hand's points, and the tracked body;
-    - ``action``: for the hand's driven ``joints``, in [-1, 1]; ``target = middle + half * action``
-      (m, rad). If there is a ``wrist``, the targets of the first ``len(low)`` joints are instead
+    - ``action``: for the hand's driven ``joints``, first clipped to [-1, 1]; then
+      ``target = middle + half * action`` (m, rad). If there is a ``wrist``, the targets of the
+      first ``len(low)`` joints are instead
       ``clip(path[min(t + lead_steps, T-1)] + largest * action, low, high)``;
     - ``actuators``: names, in the order of MuJoCo's ``ctrl``;
-    - ``control``: physics steps of ``timestep_s`` per control step, and how many joints, first in
-      ``qvel``, get ``qfrc_bias`` as applied force at the start of each control step;
-    - ``start``: the start state; ``episode``: the exemplar motion, and the object errors up to
-      which a step is a success and from which the object is lost.
+    - ``control``: ``timestep_s`` of a physics step, and ``substeps`` per control step; during a
+      control step the first ``compensated_joints`` joints of ``qvel`` get as applied force the
+      ``qfrc_bias`` of the step's start;
+    - ``start``: the start state; ``episode``: the exemplar motion, the object errors up to
+      which a step is a success and from which the object is lost, and the terminations' names.
     """
     scene, mdp = builder.scene, builder.mdp
     index, model = scene.index, scene.model
@@ -90,7 +92,7 @@ def _parts(layout: str, builder: EnvBuilder, joints: list[str]) -> list[_Part]:
     index, model = builder.scene.index, builder.scene.model
     tracked = model.body(index.object_body).name
     points = [model.geom(i).name for i in index.point_geoms]
-    time = ("time", 8, "sin and cos of 1, 4, 6 and 8 t/T", ())
+    time = ("time", 8, "first sin, then cos, of 1, 4, 6 and 8 times t/T", ())
     if layout == "paper":
         tips = [points[i] for i in index.fingertips]
         return [

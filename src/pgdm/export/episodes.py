@@ -39,7 +39,7 @@ class EpisodesRequest:
 
 
 def dataset_id(policy: TrainedPolicy) -> str:
-    """Return the name of a policy's dataset, such as ``pgdm/hammer-use1/sac-v0``."""
+    """Return the name of a policy's dataset, such as ``pgdm/hammer-use1/sac-s1-v0``."""
     name = f"{policy.cfg.algo.name}-s{policy.cfg.seed}".replace(".", "-")
     return f"pgdm/{policy.cfg.task.id}/{name}-v0"
 

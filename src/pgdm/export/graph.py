@@ -48,8 +48,8 @@ class PolicyGraph(nn.Module):
             step: (N,) int64, control steps since reset, 0 to T-2.
 
         Returns:
-            Actions (N, A) float32, in the order of the hand's driven joints; MuJoCo's ``ctrl``,
-            (N, nu) float64, m and rad.
+            Actions (N, A) float32, in the order of the hand's driven joints, not yet clipped to
+            [-1, 1]; MuJoCo's ``ctrl`` for the clipped actions, (N, nu) float64, m and rad.
         """
         action = self.network.mean(observation)
         return action, self.actions.act(action, step)[:, self.inverse]

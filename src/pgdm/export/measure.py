@@ -22,18 +22,20 @@ def measure(
     """Return a policy's metrics, see `Evaluator.evaluate`; None if it was stopped.
 
     Args:
-        policy: the policy; its ``cfg.seed`` seeds the action noise.
+        policy: the policy; its ``cfg.seed`` seeds the action noise and the task's randomisation.
         builder: builder of the policy's task.
         progress: called with the control steps done.
         stop: polled before each step; True stops.
-        episodes: number of sampled episodes; None: as in the evaluations during training.
-        deterministic: whether only the deterministic metrics are needed.
+        episodes: number of sampled episodes and, if the task is randomised, of deterministic ones;
+            None: as in the evaluations during training.
+        deterministic: whether only the deterministic metrics are needed; the sampled ones are then
+            of a single episode.
     """
     cfg = policy.cfg
     count, wanted = threads(cfg), episodes or cfg.eval.episodes
     evaluator = Evaluator(
         lambda n: builder.make(n, min(n, count), cfg.seed, "eval"),
-        # The evaluator always samples too; one episode is enough if that is not needed.
+        # The evaluator always runs sampled episodes; one is enough if they are not needed.
         1 if deterministic else wanted,
         wanted if cfg.task.randomize else 1,
         cfg.seed,

@@ -195,6 +195,9 @@ def _statistics(path: Path | None, size: int) -> tuple[dict[str, Tensor], float]
             "belongs to another policy"
         )
     if not clip > 0 or not eps >= 0:
-        raise CheckpointError(f"'{path}' clips at {clip:g} with epsilon {eps:g}")
+        raise CheckpointError(
+            f"'{path}' clips at {clip:g} with epsilon {eps:g}; valid: a clip above 0, an epsilon "
+            "of 0 or more"
+        )
     values = {"mean": mean, "var": np.maximum(var + eps - EPS, 0.0), "count": np.array(count)}
     return {f"normalizer.{name}": torch.from_numpy(v) for name, v in values.items()}, clip

@@ -74,7 +74,7 @@ def read(path: Path) -> TrainedPolicy:
 
     Raises:
         CheckpointError: if the file is missing, is damaged or holds no policy of pgdm.
-        ConfigError: if its settings are damaged.
+        ConfigError: if its settings are damaged, or of another task.
     """
     try:
         raw = files.read_bytes(path, MOST_BYTES)
@@ -185,7 +185,9 @@ def _network(
         return network_of(settings, state)
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         reason = f"{type(error).__name__}: {files.reason(error):.200}"
-        raise CheckpointError(f"{where} holds no policy of this version ({reason})") from error
+        raise CheckpointError(
+            f"{where} holds no policy that this pgdm can read ({reason})"
+        ) from error
 
 
 def halved(policy: TrainedPolicy) -> TrainedPolicy:

@@ -67,7 +67,7 @@ def curves(
         results: the runs.
         metric: ``SUCCESS`` or ``ERROR``.
         file: the PNG.
-        progress: called with the numbers of panels drawn and to draw.
+        progress: called with the number of panels drawn and that of all panels.
 
     Returns:
         Task to the PNG of its panel.
@@ -184,7 +184,11 @@ def mean_curve(runs: Sequence[Run], metric: str) -> tuple[Array, Array, Array]:
 
 
 def mean_line(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
-    """Return the same for curves, each a pair of frames and values to interpolate linearly."""
+    """Return frames, mean and standard deviation of curves, up to the end of the shortest.
+
+    Args:
+        lines: frames and values of each curve; values between them are interpolated linearly.
+    """
     last = min(frames[-1] for frames, _ in lines)
     every = np.unique(np.concatenate([frames for frames, _ in lines]))
     every = every[every <= last]

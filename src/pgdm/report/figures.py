@@ -203,7 +203,11 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
 
 
 def line_axes(panels: dict[str, tuple[float, float] | None]) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel below another for each label; its y-range may be given."""
+    """Return a figure and its axes, one below the other.
+
+    Args:
+        panels: label of each panel to its y-range; None: as the data need.
+    """
     figure = _figure(2.2 * len(panels) + 0.6)
     drawn = list(figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0])
     for axes, (label, extent) in zip(drawn, panels.items(), strict=True):

@@ -95,7 +95,8 @@ def validated(results: Results, rows: Sequence[Average]) -> Figure | None:
 def _runs(results: Results, row: Average) -> dict[str, list[Run]]:
     """Return the runs of each of a row's tasks that have a curve.
 
-    These are the finished runs of a task or, if there are none, all that have not failed.
+    These are the finished runs of a task or, if there are none, all that have not failed. A curve
+    needs two evaluations.
     """
     found = {}
     for task in results.tasks:

@@ -183,7 +183,10 @@ def _provenance(results: Results) -> list[tuple[str, list[tuple[str, int]]]]:
 
 
 def _commands(results: Results) -> list[str]:
-    """Return the commands that reproduce the runs, one per setting."""
+    """Return the commands that reproduce the runs, one per setting.
+
+    A command has every seed for every task, so it starts more runs if tasks differ in seeds.
+    """
     found = []
     for setting in results.settings:
         tasks = [task for task in results.tasks if results.cell(setting, task)]

@@ -68,7 +68,10 @@ class Results:
         metric: str = SUCCESS,
         wanted: Callable[[Run], bool] = lambda run: True,
     ) -> dict[str, Array]:
-        """Return a metric of the finished runs of a setting: task to one value per run."""
+        """Return a metric of the finished runs of a setting: task to one value per run.
+
+        Runs for which ``wanted`` is false, or whose value is not finite, are left out.
+        """
         found = {}
         for task in self.tasks:
             runs = [run for run in self.cell(setting, task) if run.finished and wanted(run)]
@@ -82,7 +85,8 @@ class Results:
 
         Args:
             setting: the setting.
-            groups: config groups that the paper's table varies too, and that do not count.
+            groups: config groups whose option the paper's table varies too; the option does not
+                count.
         """
         found = setting.deviations(*groups)
         wanted = setting.option("pregrasp")

@@ -64,7 +64,8 @@ class Setting:
         """Return why its results are not comparable with the paper's; empty if they are.
 
         Args:
-            groups: config groups that the paper's table varies too, and that do not count.
+            groups: config groups whose option the paper's table varies too; the option does not
+                count.
         """
         frames = self.total_frames
         fewer = [f"{frames:,} of {PAPER_FRAMES:,} frames"] if frames < PAPER_FRAMES else []

@@ -42,7 +42,7 @@ class Found:
 
     runs: list[Run] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
-    """Folder to reason."""
+    """Folder, or plan file of a sweep, to reason."""
     commands: list[str] = field(default_factory=list)
     """Commands that started the sweeps, if known."""
 

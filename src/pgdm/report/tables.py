@@ -43,10 +43,12 @@ class Average:
     rotation: Estimate
     same: dict[str, float]
     """The paper's average over the same tasks: ``success`` and ``com_error``; NaN unless the row is
-    PGDM with pre-grasps and no ablation, to which the paper's values by task belong."""
+    PGDM with pre-grasps, each task's own hand and no ablation: the paper has values by task only
+    for that."""
     paper: dict[str, float] = field(default_factory=dict)
     """The paper's own average: ``success``, ``com_error`` and, if stated, ``ori_error`` and
-    ``tasks``; empty if the paper has no such row, as for another method's ablation."""
+    ``tasks``; empty if the paper has no such row, as for another method's ablation or
+    another hand than the task's own."""
     deviations: tuple[str, ...] = ()
     """Why the row is not comparable with the paper."""
 
@@ -79,7 +81,7 @@ class Improvement(NamedTuple):
 
 
 def by_source(results: Results) -> list[Average]:
-    """Return Table I: rows by pre-grasp source, for each setting of PGDM without ablation."""
+    """Return Table I: rows by pre-grasp source, for each setting that is `Setting.plain`."""
     rows = []
     for setting in results.settings:
         if setting.plain:
@@ -106,7 +108,10 @@ def by_ablation(results: Results) -> list[Average]:
 
 
 def baselines(results: Results) -> list[Average]:
-    """Return methods with and without pre-grasps on tcdm30; empty if there is only one row."""
+    """Return methods with and without pre-grasps on tcdm30.
+
+    Empty if there is only one method, and only with pre-grasps or only without.
+    """
     settings = [s for s in results.settings if s.option("ablation") == "none"]
     if len({(s.method, s.with_pregrasp) for s in settings}) < 2:
         return []
@@ -214,7 +219,7 @@ def _average(
 
 
 def _from(source: str) -> Callable[[Run], bool]:
-    """Return a predicate: whether a run of the paper's 50 tasks belongs to a row of Table I."""
+    """Return a predicate for a row of Table I: runs of the paper's tasks with this source."""
 
     def wanted(run: Run) -> bool:
         own = run.facts.get("pregrasp_source")

@@ -26,11 +26,11 @@ def find_checkpoint(path: Path, best: bool) -> tuple[Path, Path, State]:
     Args:
         path: a run folder, or a checkpoint in one.
         best: for a run folder, whether to take the checkpoint of highest success (if equal, of
-            highest return) with sampled actions, if there is one, instead of the last.
+            highest return) with sampled actions, if there is one, instead of the newest usable one.
 
     Raises:
-        RunError: if ``path`` is neither.
-        CheckpointError: if the run has no checkpoint yet, or it is damaged.
+        RunError: if ``path`` is neither, or a link leads out of the run folder.
+        CheckpointError: if the run has no checkpoint yet, or none that can be used.
     """
     path = located(path)
     folder = folder_of(path)
@@ -88,7 +88,8 @@ class LoadedPolicy:
             Actions (N, A) or (A,) float32, NumPy or torch as ``obs``.
 
         Raises:
-            ConfigError: if observations are not of size D: the environment has other settings.
+            ConfigError: if ``obs`` has neither of these shapes, as when the environment has other
+                settings.
         """
         rows = torch.as_tensor(obs, dtype=torch.float32)
         if rows.ndim not in (1, 2) or rows.shape[-1] != self.obs_dim:
@@ -107,13 +108,14 @@ def load_policy(run: str | PathLike[str], *, best: bool = False, seed: int = 0) 
     Args:
         run: a run folder, or a checkpoint in one.
         best: for a run folder, whether to take the checkpoint of highest success (if equal, of
-            highest return) with sampled actions, if there is one, instead of the last.
+            highest return) with sampled actions, if there is one, instead of the newest usable one.
         seed: seed of the noise of sampled actions.
 
     Raises:
         ConfigError: if ``run`` is not a path.
-        RunError: if ``run`` is neither a run folder nor a checkpoint in one.
-        CheckpointError: if the run has no checkpoint yet, or it is damaged.
+        RunError: if ``run`` is neither a run folder nor a checkpoint in one, or a link leads out of
+            the folder.
+        CheckpointError: if the run has no checkpoint yet, or none that can be used.
     """
     if not isinstance(run, str | PathLike):
         raise ConfigError(f"run is {run!r:.60}; it must be a run's folder, or a checkpoint in one")

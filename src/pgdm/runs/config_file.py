@@ -1,4 +1,7 @@
-"""Read and write ``config.yaml``, a run's settings, as plain data; typed in `pgdm.config.saved`."""
+"""Read and write ``config.yaml``, a run's settings, as plain data.
+
+`pgdm.config.saved` turns that into an `ExperimentCfg`.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,8 @@ def read_config(run_dir: Path) -> dict[str, Any]:
     """Return the settings in a run folder, ``format`` included.
 
     Raises:
-        RunError: if ``config.yaml`` is missing, is not valid YAML or holds no mapping.
+        RunError: if ``config.yaml`` is missing or unreadable, is not valid YAML or holds no
+            mapping.
     """
     file = run_dir / CONFIG
     try:

@@ -13,7 +13,7 @@ CONFIG = "config.yaml"
 LOG = "metrics.jsonl"
 RESULT = "result.json"
 LINK = "mlflow.json"
-"""File that names the MLflow run that mirrors this one. From the start of the run it also has the
+"""File that names the MLflow run that mirrors this one. Once MLflow is reached, it also has the
 values of `pgdm.runs.folder.FACTS`, which ``result.json`` has only at the end."""
 LOCK = ".lock"
 """Held by the process that trains in the folder."""

@@ -39,8 +39,8 @@ ARTIFACTS = "mlflow-artifacts"
 """Folder next to ``mlflow.db`` with MLflow's copies of files; it is not searched for runs."""
 STATUSES = ("running", "finished", "interrupted", "failed")
 SILENT_S = 600.0
-"""Where locks do not work, a run without a result counts as killed once it has written nothing for
-this long."""
+"""If the lock file is missing or locks do not work, a run without a result counts as killed once it
+has written nothing for this long."""
 
 # Tag -> key of its value in config.yaml.
 TAGS = {
@@ -60,7 +60,7 @@ FACTS = ("asset_source", "pregrasp_used", "expert_hand", "motion_sha256", "git")
 
 
 class RunFolder:
-    """The folder of one run; each file is read when first needed.
+    """The folder of one run; ``config.yaml`` and ``result.json`` are read once, when first needed.
 
     Args:
         path: the folder, which holds ``config.yaml``.
@@ -85,7 +85,9 @@ class RunFolder:
 
     @cached_property
     def result(self) -> dict[str, Any]:
-        """Contents of ``result.json``; {} if it is missing, since the run continues or was killed.
+        """Contents of ``result.json``; {} if it is missing or damaged.
+
+        It is missing while the run continues, and if the run was killed.
 
         Raises:
             RunError: if it holds values of wrong types.
@@ -100,7 +102,7 @@ class RunFolder:
 
     @property
     def link(self) -> dict[str, Any]:
-        """Contents of ``mlflow.json``; {} if no MLflow run mirrors this one."""
+        """Contents of ``mlflow.json``; {} if it is missing or damaged."""
         link = read_json(self.path / LINK)
         return {} if fault(link, LINK_KINDS) else link
 
@@ -170,7 +172,7 @@ class RunFolder:
         return total if isinstance(total, int) else 0
 
     def modified(self) -> float:
-        """Return when the run last wrote something, s since the epoch."""
+        """Return when settings, records or result were last written, s since the epoch, or 0."""
         written = (self.path / name for name in (LOG, RESULT, CONFIG))
         return max((file.stat().st_mtime for file in written if file.exists()), default=0.0)
 
@@ -198,7 +200,10 @@ class RunFolder:
         return digest.hexdigest()[:16]
 
     def artifacts(self) -> list[tuple[Path, str]]:
-        """Return the files that a tracker should copy, each with its subfolder."""
+        """Return the files that a tracker should copy, each with its subfolder.
+
+        Files of more than ``files.MOST_BYTES`` are left out.
+        """
         plain = [(self.path / name, "") for name in (CONFIG, RESULT, LOG)]
         checkpoints = self.path / CHECKPOINTS
         newest = sorted(checkpoints.glob("frames_*.ckpt"))[-1:]
@@ -210,7 +215,9 @@ class RunFolder:
 
 
 def check_links(run_dir: Path) -> None:
-    """Refuse a run folder with a link that leads out of it, where pgdm would read or write.
+    """Refuse a run folder with a link that leads out of it.
+
+    Through such a link pgdm would read or write files elsewhere.
 
     Raises:
         RunError: if there is such a link.
@@ -229,10 +236,11 @@ def holds_run(run_dir: Path, resume: str) -> bool:
 
     Args:
         run_dir: the folder; it may be missing.
-        resume: ``auto``; ``must`` permits only an existing run, ``never`` only a new one.
+        resume: ``must`` permits only an existing run, ``never`` only a new one, ``auto`` both.
 
     Raises:
-        RunError: if ``resume`` forbids the use, or the folder holds something other than a run.
+        RunError: if ``resume`` forbids the use, the folder holds something other than a run, or a
+            link in it leads out of it.
     """
     if run_dir.exists() and not run_dir.is_dir():
         raise RunError(f"run_dir '{run_dir}' is a file; choose a folder")
@@ -271,7 +279,10 @@ def claimed(run_dir: Path) -> Iterator[None]:
 
 
 def located(path: Path) -> Path:
-    """Return a path that may be given relative to the folder of runs, as `pgdm runs` lists it."""
+    """Return a path; if it exists only below the folder of runs, return it with that folder.
+
+    ``pgdm runs`` lists runs relative to the folder of runs.
+    """
     below = paths.runs() / path
     return below if below.exists() and not path.exists() else path
 

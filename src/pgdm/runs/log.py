@@ -68,6 +68,8 @@ class RunLog:
     def read(self) -> list[Record]:
         """Return all records in order; of those with equal kind and frames only the last one.
 
+        Damaged lines are skipped with a warning.
+
         Raises:
             RunError: if the file exists but cannot be read.
         """
@@ -124,8 +126,10 @@ class RunLog:
     def truncate(self, frames: int) -> int:
         """Drop all records after ``frames``, atomically: a resumed run writes them again.
 
+        Damaged and unfinished lines are dropped as well.
+
         Returns:
-            Number of lines dropped, an unfinished one included.
+            Number of lines dropped.
 
         Raises:
             RunError: if the file cannot be read or written.

@@ -30,9 +30,9 @@ def versions() -> dict[str, str]:
 
 
 def git_revision() -> str | None:
-    """Return the git revision of the source, with ``+`` if it has uncommitted changes.
+    """Return the git revision of the source, with ``+`` if the package has uncommitted changes.
 
-    None if the source is not in a git checkout.
+    None if the source is not in a git checkout, or git cannot be run.
     """
     here = Path(__file__).resolve().parents[1]  # the whole package
     try:
@@ -45,7 +45,9 @@ def git_revision() -> str | None:
 def check_assets(
     recorded: Mapping[str, Any], builder: EnvBuilder, where: Path, notify: Notify
 ) -> None:
-    """Check that a checkpoint was trained with the current assets; report other versions.
+    """Check that a checkpoint was trained with the current assets.
+
+    Other versions of MuJoCo or PyTorch are only reported.
 
     Raises:
         RunError: if other assets were used; the message names what differs.
@@ -53,8 +55,8 @@ def check_assets(
     for difference in builder.differences(recorded):
         raise RunError(
             f"{where} was trained with {difference}; restore the library ('pgdm assets list' shows "
-            "it, 'pgdm assets fetch' adds registry, 'pgdm assets import PATH' checkout), or start "
-            "anew in another run_dir"
+            "it, 'pgdm assets fetch' adds the source registry, 'pgdm assets import PATH' the "
+            "source checkout), or start anew in another run_dir"
         )
     before, now = recorded.get("versions", {}), versions()
     for package in ("mujoco", "torch"):

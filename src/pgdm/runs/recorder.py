@@ -50,8 +50,8 @@ class Recorder(Callback):
         """Train, and record how it ends.
 
         Args:
-            trainer: the trainer; its settings are in the run folder already.
-            resumed: whether training starts from a checkpoint; if so, earlier records are kept.
+            trainer: the trainer; the run folder must already hold the run's settings.
+            resumed: whether training starts from a checkpoint; if so, records up to it are kept.
 
         Raises:
             PgdmError: if the training fails, or its records cannot be written.

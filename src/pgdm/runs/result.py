@@ -16,8 +16,8 @@ from pgdm.runs.log import metrics_of
 from pgdm.runs.provenance import versions
 
 ENDED_BY, TIME_LIMIT = "ended_by", "time_limit"
-"""Key in ``result.json`` of a finished run, and its value if ``time_limit_min`` ended it; else
-``frames``."""
+"""Key in ``result.json`` of a finished run, and its value if ``time_limit_min`` ended the run. If
+it reached its length, the value is ``frames``."""
 WRIST_BOUND = "wrist_bound"
 """Key in ``result.json``: the wrist plan's ``rigid_grasp``, 0..1."""
 
@@ -90,8 +90,8 @@ class Reached:
 def reached(folder: RunFolder, total_frames: int, time_limit_min: float | None = 0.0) -> Reached:
     """Return a run's status and progress, from its result or, if missing, from its records.
 
-    A run without a result, or with that of a shorter run, counts as interrupted. The arguments are
-    as for `is_whole`.
+    A run without a result counts as interrupted, and so does a finished run that has more to do
+    under the current settings. The arguments are as for `is_whole`.
     """
     result = folder.result
     frames, metrics = result.get("frames"), result.get("metrics")

@@ -24,8 +24,8 @@ class Tracker(ABC):
     def finish(self, status: str, patience_s: float = 60.0) -> None:  # noqa: B027 (optional)
         """Close the mirror with status ``finished``, ``interrupted`` or ``failed``.
 
-        Called once, after the last file of the run folder (``result.json``) is written, so that
-        files can be copied. Must return within ``patience_s``.
+        Called once, when nothing more is written to the run folder, so that its files can be
+        copied. Must return within ``patience_s``.
         """
 
 

@@ -30,7 +30,8 @@ _HANDOVER_S = 60.0
 _log = logging.getLogger(__name__)
 
 Train = Callable[["ExperimentCfg", bool], int]
-"""Trains with given settings, ignoring further stop signals if flagged; returns the exit code."""
+"""Trains with the given settings, and returns the exit code. The flag is True if stop signals after
+the first are to be ignored."""
 
 
 def stop_with_parent() -> None:
@@ -52,10 +53,11 @@ def attempt(
         train: trains with the given settings.
 
     Raises:
-        PgdmError: if the ledger has closed the attempt before it began, or the run fails.
+        PgdmError: if the ledger has closed the attempt before it began, the sweep's files cannot
+            be used, or the run fails.
     """
     if not Ledger(folder).register(key, number, Process.of(os.getpid()), slurm_id):
-        raise SweepError("this attempt was given up before it began")
+        raise SweepError("this attempt was given up before it began: the ledger has it as ended")
     from pgdm.sweep.plan import read_job
 
     job = read_job(folder, key)
@@ -65,7 +67,7 @@ def attempt(
 
 
 def _train_in_slurm(cfg: ExperimentCfg, slurm_id: str, train: Train) -> int:
-    """Train; if Slurm stops the run early but it has made progress, have Slurm requeue it."""
+    """Train; if Slurm stops the run early but it has made progress, have Slurm requeue the job."""
     folder = Path(cfg.run_dir)
     limit = time.monotonic() + _HANDOVER_S
     while RunFolder(folder).busy and time.monotonic() < limit:  # an earlier process is saving
@@ -75,6 +77,6 @@ def _train_in_slurm(cfg: ExperimentCfg, slurm_id: str, train: Train) -> int:
     if code in STOPPED and (run_ending(folder, cfg.total_frames).frames or 0) > before:
         try:
             requeue(slurm_id)
-        except SweepError as error:  # users may not requeue here: the driver starts a new attempt
+        except SweepError as error:  # where users may not requeue, the driver starts a new attempt
             _log.warning("cannot requeue this job: %s", error)
     return code

@@ -55,7 +55,8 @@ class Driver:
 
     Args:
         plan: the jobs.
-        max_attempts: how many times a job is tried before it counts as failed.
+        max_attempts: how many times this driver tries a job before the job counts as failed;
+            see also ``Ended.displaced``.
         launcher: starts workers.
         front: shows the sweep's state to the user.
     """
@@ -131,7 +132,11 @@ class Driver:
             self._left_over.append(entry)
 
     def _first_state(self, entry: Entry) -> str:
-        """Return FINISHED or WAITING: a job is finished only if its run folder says so."""
+        """Return FINISHED or WAITING.
+
+        A job is finished only if its run folder says so, and either the ledger does too or the
+        folder holds the run of this job.
+        """
         job = self._jobs[entry.key]
         done = job_ending(job).state == FINISHED
         known = entry.state == FINISHED or (done and holds(job))
@@ -143,7 +148,7 @@ class Driver:
             if stop() and self._launcher.stays:
                 return
             if stop():
-                self._left_over.clear()  # they stop by themselves, since their driver died
+                self._left_over.clear()  # local ones stop by themselves when their driver dies
             self._take_over()
             states = self._ledger.states()
             self._ask(
@@ -265,7 +270,7 @@ def _frames(job: Job) -> int:
 
 
 def _last_error(log: Path) -> str:
-    """Return the last error in a log, or its last line."""
+    """Return the last line of a log that starts with ``error: ``, or else its last line."""
     text = log.read_text(errors="replace") if log.exists() else ""
     lines = [line for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("error: ")]

@@ -65,7 +65,7 @@ def estimate(plan: Plan, root: Path, progress: StepProgress = silent) -> Estimat
 
 
 def _frames_done(job: Job) -> int:
-    """Return the frames of a job so far; fewer than all of them until it is finished."""
+    """Return the frames that a job has completed: ``total_frames`` only if it is finished."""
     total = job.cfg.total_frames
     try:
         found = run_ending(Path(job.cfg.run_dir), total, job.cfg.time_limit_min)
@@ -75,7 +75,7 @@ def _frames_done(job: Job) -> int:
 
 
 def _speeds(plan: Plan, root: Path) -> list[float]:
-    """Return the speed, in frames/s, of the earlier runs most similar to the plan's."""
+    """Return the speeds, in frames/s, of the earlier runs most similar to those of the plan."""
     runs = [run for run in find_runs(root) if (run.path / RESULT).exists()]
     runs.sort(key=lambda run: (run.path / RESULT).stat().st_mtime)
     rows = []

@@ -68,7 +68,10 @@ def _values(override: Override, tasks: Tasks, most: int) -> Sequence[str]:
     if override.key_or_group == "task":
         values = list(tasks([value.strip("'\"") for value in values]))
     if not values:
-        raise ConfigError(f"'{override.input_line}' leaves nothing to run")
+        raise ConfigError(
+            f"'{override.input_line}' leaves nothing to run; give at least one value that is not "
+            "excluded again"
+        )
     return values
 
 

@@ -16,7 +16,9 @@ from pgdm.pregrasp.sources import stored_source
 def foresee(
     cfgs: Sequence[ExperimentCfg], library: Library, progress: StepProgress = silent
 ) -> list[str]:
-    """Return a sentence for each kind of start state or asset that is missing or replaced.
+    """Return sentences on start states and assets that are missing, replaced or approximate.
+
+    One more sentence says how many tasks need a wrist plan.
 
     Args:
         cfgs: settings of the runs.
@@ -24,7 +26,8 @@ def foresee(
         progress: called with the number of runs looked at so far.
 
     Raises:
-        ConfigError: if a start state is missing and cannot be generated automatically.
+        ConfigError: if a start state is missing, has no stored substitute and cannot be generated
+            automatically.
     """
     replaced: Counter[tuple[str, str]] = Counter()
     used_by: dict[object, str] = {}

@@ -35,7 +35,7 @@ def run_sweep(plan: Plan, sweep: SweepCfg, launcher: LauncherCfg, front: Front) 
     """Run the unfinished jobs of a sweep, and return the exit code.
 
     0: every job is finished, or the sweep runs in the background; 1: some jobs are not finished;
-    130 or 143: stopped by a signal.
+    130, 140 or 143: stopped by SIGINT (Ctrl-C), SIGUSR2 or SIGTERM.
 
     Args:
         plan: the jobs; its folder may hold them in any state.
@@ -45,7 +45,8 @@ def run_sweep(plan: Plan, sweep: SweepCfg, launcher: LauncherCfg, front: Front) 
 
     Raises:
         SweepError: if another process drives the sweep, the folder holds a sweep with other
-            settings or cannot be used, Slurm is not installed, or it refuses the jobs.
+            settings or cannot be used, the background process fails to start, Slurm is not
+            installed or refuses the jobs, or squeue has failed for an hour.
     """
     if not isinstance(launcher, LocalCfg):
         check_slurm()

@@ -34,7 +34,8 @@ class Ended:
     error: str | None = None
     """What ended the worker, unless it exited by itself."""
     displaced: bool = False
-    """Whether Slurm preempted the worker or its time ran out; neither counts as a failure."""
+    """Whether Slurm preempted the worker, its time ran out, or it saved and stopped on a signal.
+    Such an attempt does not count towards ``max_attempts`` if the run made progress."""
 
 
 class Launcher(Protocol):

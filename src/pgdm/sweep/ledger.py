@@ -48,7 +48,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Attempt:
-    """One process that worked on a job.
+    """One process that works or worked on a job; in Slurm one Slurm job, even if it is requeued.
 
     While it runs, it has no end, exit code, frames, metrics or error.
     """
@@ -98,13 +98,13 @@ class Ending:
 class Ledger:
     """The ledger of the sweep in a folder; the file is created if it is missing.
 
-    Each method is one transaction. If the file is locked, it is retried for up to ``LOCK_S``.
+    Each change is one transaction. If the file is locked, it is retried for up to ``LOCK_S``.
 
     Args:
         folder: folder of the sweep.
 
     Raises:
-        SweepError: from every method, if the file cannot be read or written.
+        SweepError: from every method, if the file cannot be read or written, or stays locked.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -167,9 +167,9 @@ class Ledger:
         return self._do(work)
 
     def submitted(self, slurm_ids: Mapping[tuple[str, int], str]) -> None:
-        """Record the Slurm job ID of each attempt, which is given by job key and number."""
-        # Until now the driver is recorded as their process. An attempt that already runs has
-        # registered its process and Slurm job ID itself.
+        """Record the Slurm job IDs of attempts, each attempt given by job key and number."""
+        # Until now the driver is recorded as the attempts' process. An attempt that already runs
+        # has registered its own process and Slurm job ID: its row is not changed.
         self._write(
             "UPDATE attempts SET slurm_id = ?, host = '', pid = 0, born = '' "
             "WHERE key = ? AND number = ? AND slurm_id IS NULL",
@@ -197,7 +197,7 @@ class Ledger:
         )
 
     def recall(self, key: str, start: float, end: float, ending: Ending) -> None:
-        """Record a past attempt that is known only from its run folder."""
+        """Record as attempt 1 what is known only from a job's run folder, unless there is one."""
         row = (key, ending.state, start, end, ending.frames, json.dumps(ending.metrics))
         self._write(
             "INSERT OR IGNORE INTO attempts (key, number, state, host, pid, born, start, end, "

@@ -32,7 +32,11 @@ class SweepMirror:
 
     @classmethod
     def of(cls, plan: Plan, notify: Notify) -> SweepMirror:
-        """Return the mirror of a plan, in the MLflow store of its first job that uses MLflow."""
+        """Return the mirror of a plan; it mirrors nothing if no job uses MLflow.
+
+        Store and MLflow experiment are those of the first job that uses MLflow. If its settings
+        name no store, the sweep stays in its own database, or gets one.
+        """
         chosen = next((j.cfg.tracking for j in plan.jobs if j.cfg.tracking.kind == "mlflow"), None)
         if chosen is None:
             return cls(None, notify)
@@ -42,7 +46,7 @@ class SweepMirror:
         known = str(read_json(plan.folder / LINK).get("uri", ""))
         file = sqlite_file(known)
         stays = is_own(known, plan.folder) and file is not None and file.exists()
-        # A sweep below the folder of runs is kept in their database, any other in its own folder.
+        # A sweep below the folder of runs gets the database of that folder, any other its own.
         runs = paths.runs().absolute()
         here = store_uri(runs if plan.folder.is_relative_to(runs) else plan.folder)
         uri = chosen.uri or (known if stays else here)
@@ -55,8 +59,9 @@ class SweepMirror:
         Args:
             folder: folder of the sweep.
             dead: run folders of workers that were found dead.
-            status: how the sweep ended; recorded if MLflow still has it as running.
-            notify: called with a sentence if MLflow fails.
+            status: how the sweep ended; recorded if ``mlflow.json`` still has it as running.
+            notify: called with a sentence if MLflow fails, or if the store is not that of the
+                sweep or of a folder above it, and so is not changed.
         """
         link = read_json(folder / LINK)
         running = link.get("status") == RUNNING
@@ -68,7 +73,8 @@ class SweepMirror:
         uri = str(link["uri"])
         if not is_own(uri, folder):
             notify(
-                f"MLflow at {uri} was not changed; `pgdm runs sync --uri {uri}` corrects its runs"
+                f"MLflow at {uri} was not changed, since it is not a database in the sweep's "
+                f"folder or above; `pgdm runs sync --uri {uri}` corrects its runs"
             )
             return
         mirror = cls(Group(folder, uri, link["experiment"]), notify)

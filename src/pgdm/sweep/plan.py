@@ -35,7 +35,7 @@ class SweepCfg:
     max_attempts: int
     """How many times a job is tried per start of the sweep before it counts as failed."""
     detach: bool
-    """Run in the background, and return immediately."""
+    """Run in the background, and return as soon as the sweep runs there."""
     dry_run: bool
     """Print the plan, and start nothing."""
     most_jobs: int
@@ -52,9 +52,10 @@ class LocalCfg:
     """Most jobs at a time; 0: as many as cores and memory allow."""
     cores_per_job: int
     """Threads of a job that leaves ``num_threads`` at 0; 0: as many as the largest ``num_threads``
-    of the other jobs or, if all are 0, the cores divided by the jobs at a time."""
+    of the other jobs or, if all are 0, the cores divided by the jobs at a time. Unless ``max_jobs``
+    is set, the jobs at a time are at most the cores divided by this number."""
     memory_per_job_gb: float
-    """Memory to allow for each job [GB]."""
+    """Memory to allow for each job [GB]; not used if ``max_jobs`` is set."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class SlurmCfg:
     time_min: int
     """Time limit of a Slurm job, which saves shortly before it and is requeued [min]."""
     cores_per_job: int
-    """Cores, and threads, of each job."""
+    """Cores of each job, and threads of a job that leaves ``num_threads`` at 0."""
     memory_per_job_gb: float
     """Memory of each job [GB]."""
     gpus_per_job: int
@@ -88,7 +89,7 @@ class SlurmCfg:
     poll_s: float
     """Time between two queries to Slurm, each for all jobs [s]."""
     setup: list[str]
-    """Shell commands before each job."""
+    """Shell commands that run before each job."""
     additional_parameters: list[str]
     """Further options of sbatch, each ``NAME`` or ``NAME=VALUE``."""
 
@@ -131,7 +132,7 @@ class Job:
     """One experiment of a sweep."""
 
     key: str
-    """16 hex digits, a hash of every setting that changes the result."""
+    """16 hex digits, a hash of the experiment's identity and ``total_frames``."""
     name: str
     """What distinguishes the job from the others, such as ``task=cup-pour1 seed=1``."""
     overrides: tuple[str, ...]
@@ -155,7 +156,7 @@ class Plan:
 
 
 def job_key(cfg: ExperimentCfg) -> str:
-    """Return 16 hex digits, equal for two experiments that have the same result."""
+    """Return 16 hex digits, equal for experiments of equal identity and ``total_frames``."""
     # An identity omits total_frames, so that a longer run can resume a shorter one; a key has it.
     whole = identity(cfg) | {"total_frames": cfg.total_frames}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
@@ -175,7 +176,8 @@ def check_fits(plan: Plan) -> tuple[Job, ...]:
     """Return the jobs already recorded in a plan's folder, checked for changed settings.
 
     Raises:
-        SweepError: if a job of the same name had other settings; the message lists the differences.
+        SweepError: as for ``read_plan``, or if a job of the same name had other settings; the
+            message lists the differences of the first such job.
     """
     if not (plan.folder / PLAN).exists():
         return ()

@@ -36,7 +36,8 @@ def make_plan(
         progress: called with the number of jobs checked so far.
 
     Raises:
-        ConfigError: if the settings of a job are wrong, or jobs would share a run folder.
+        ConfigError: if the settings of the sweep or of a job are wrong, or jobs would share a run
+            folder.
     """
     name = name if sweep.name is None else sweep.name
     paths.check_path_part("sweep.name", name)
@@ -60,7 +61,10 @@ def make_plan(
 
 
 def _names(composed: Sequence[Composed]) -> list[str]:
-    """Return each job's name: task, seed, and those of its overrides that differ between jobs."""
+    """Return each job's name: task, the overrides that differ between jobs, and seed.
+
+    Overrides of the other keys in ``NOT_IN_A_NAME`` are left out.
+    """
     given = [
         {key.lstrip("+"): value for key, _, value in (o.partition("=") for o in overrides)}
         for overrides, _ in composed

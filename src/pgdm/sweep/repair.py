@@ -21,13 +21,13 @@ if TYPE_CHECKING:  # these load the simulator and torch
 def repaired(folder: Path, queue: Queue | None, notify: Notify) -> Ledger:
     """Return a sweep's ledger after correcting what killed processes left in it and in MLflow.
 
-    A ledger that is missing or empty is rebuilt from the run folders. While a process drives the
-    sweep, nothing else is changed, since that process makes the corrections.
+    A ledger that is missing or empty is rebuilt from the run folders. While a process on
+    this machine drives the sweep, nothing else is changed: that process makes the corrections.
 
     Args:
         folder: folder of the sweep.
-        queue: its jobs in Slurm; None queries Slurm anew.
-        notify: called with a sentence if MLflow fails.
+        queue: the sweep's jobs in Slurm; None queries Slurm anew.
+        notify: called with a sentence if MLflow fails or may not be changed.
 
     Raises:
         SweepError: if the folder holds no sweep, or its files cannot be used.
@@ -48,7 +48,10 @@ def repaired(folder: Path, queue: Queue | None, notify: Notify) -> Ledger:
 
 
 def recall(ledger: Ledger, plan: Plan) -> None:
-    """Add a plan's jobs to a ledger; for jobs without attempts, record what their folders hold."""
+    """Add a plan's jobs to a ledger; for jobs without attempts, record what their folders hold.
+
+    A folder that is in use or holds another run is ignored.
+    """
     ledger.add(plan)
     jobs = {job.key: job for job in plan.jobs}
     for entry in ledger.entries():

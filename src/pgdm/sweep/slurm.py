@@ -1,8 +1,8 @@
 """Workers as jobs of a Slurm cluster: one job array for all that are started together.
 
-An attempt is one Slurm job. A worker that is preempted or runs out of time saves and has Slurm
-requeue the same job; after a node failure Slurm does so by itself. In both cases the attempt
-continues without a driver.
+An attempt is one Slurm job. A worker that is preempted or runs out of time saves and, if it
+has made progress, has Slurm requeue the same job; after a node failure Slurm does so by itself. In
+both cases the attempt continues without a driver.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def check_slurm() -> None:
     """Check that Slurm is installed on this machine.
 
     Raises:
-        SweepError: if not.
+        SweepError: if sbatch, srun or squeue is not on PATH.
     """
     for name in ("sbatch", "srun", "squeue"):
         if shutil.which(name) is None:
@@ -121,14 +121,14 @@ class SlurmLauncher:
         self.queue.forget()
 
     def adopt(self, assignment: Assignment, attempt: Attempt) -> bool:
-        """Follow a job that is in Slurm already."""
+        """Follow a job that is in Slurm already; return False if the attempt has no Slurm job."""
         if attempt.slurm_id is None:
             return False
         self._slurm_ids[assignment.id] = attempt.slurm_id
         return True
 
     def ended(self, assignment: Assignment) -> Ended | None:
-        """Return how one of Slurm's jobs exited.
+        """Return how one of Slurm's jobs exited; cancel a job that Slurm will never start.
 
         Raises:
             SweepError: if Slurm has been unreachable for an hour.

@@ -50,7 +50,8 @@ class Row:
     key: str
     name: str
     state: str
-    """Verified: ``running`` only if its process is alive, or Slurm runs it."""
+    """Verified: ``running`` only if its process is alive, Slurm runs it or, for a process on
+    another machine, its run folder shows it as running."""
     attempts: int
     frames: int
     """Frames of the run so far; while the job runs, up to its last record."""
@@ -59,14 +60,14 @@ class Row:
     """Sampled success, 0..1: of the last evaluation, or, while the job runs, of the episodes in its
     last iteration. None if unknown."""
     steps_per_s: float | None
-    """Speed of the last iteration; None unless the job runs."""
+    """Speed of the last iteration, frames/s; None unless the job runs."""
     frames_per_s: float | None
     """Speed over the whole run so far, evaluations included; None if unknown."""
     left_s: float | None
-    """Remaining time at ``frames_per_s``; None unless the job runs."""
+    """Remaining time at ``frames_per_s``; None if that is unknown or the job does not run."""
     run_dir: Path
     log: Path | None
-    """Output of the last attempt."""
+    """Output of the last attempt; None before the first."""
     error: str | None
     slurm: str | None
     """ID and state in Slurm of an attempt that the ledger has as running, such as
@@ -82,14 +83,15 @@ class Summary:
     frames: int
     total_frames: int
     left_s: float | None
-    """Remaining time at the current speed; None if unknown."""
+    """Remaining time of the waiting, running and interrupted jobs, at the mean ``frames_per_s`` of
+    all jobs for which it is known; None if it is for none."""
 
 
 def run_ending(run_dir: Path, total_frames: int, time_limit_min: float | None = 0.0) -> Ending:
     """Return a run's status and progress, from its folder; a killed run counts as interrupted.
 
     Args:
-        run_dir: its folder.
+        run_dir: folder of the run.
         total_frames: length that is wanted now, frames.
         time_limit_min: limit that is wanted now; None: no limit, 0: the one that ended the run.
     """
@@ -120,7 +122,7 @@ def settle(ledger: Ledger, queue: Queue | None = None) -> list[Entry]:
 
     Args:
         ledger: ledger of the sweep.
-        queue: its jobs in Slurm; None queries Slurm anew.
+        queue: the sweep's jobs in Slurm; None queries Slurm anew.
     """
     queue, closed = queue or Queue(), []
     for entry in ledger.entries():
@@ -212,7 +214,10 @@ def _row(folder: Path, entry: Entry, queue: Queue) -> Row:
 
 
 def _in_slurm(attempt: Attempt, run_dir: Path, queue: Queue) -> tuple[str | None, bool]:
-    """Return an attempt's ID and state in Slurm, or None, and whether it waits to start."""
+    """Return an attempt's ID and state in Slurm, or None, and whether it waits to start.
+
+    If Slurm cannot be queried, it counts as waiting unless its run folder shows it as running.
+    """
     if attempt.slurm_id is None:
         return None, False
     found = queue.find(attempt.slurm_id)
@@ -229,6 +234,6 @@ def _pace(last: Attempt | None, lines: Sequence[Record], frames: int) -> float |
 
 
 def _last(lines: Sequence[Record], name: str) -> Any:
-    """Return the last value of a metric that was recorded, or None."""
+    """Return the last finite value that was recorded of a metric, or None."""
     values = (line[name] for line in reversed(lines) if name in line)
     return next((v for v in values if isinstance(v, int | float) and math.isfinite(v)), None)

@@ -15,7 +15,8 @@ from pgdm.paths import as_name
 
 _KEY = "+sweep"
 
-# Settings that say which jobs run, where, how fast or how often; names of sweeps omit them.
+# Settings that say which jobs run, where, how fast or how often. Names of sweeps omit them, and
+# names of jobs omit all but task and seed.
 NOT_IN_A_NAME = (
     "task", "seed", "sweep", "hydra", "run_dir", "resume", "offline", "num_threads", "device",
     "tracking", "checkpoint",
@@ -23,7 +24,7 @@ NOT_IN_A_NAME = (
 
 
 def studies(config_dir: str | Path | None = None) -> dict[str, Path]:
-    """Return the sweep files by name; pgdm's file comes before a user's of the same name."""
+    """Return the sweep files by name; pgdm's file hides a user's of the same name."""
     # pgdm's are next to conf/, both in a checkout and in an installed package.
     places = [conf_dir().parent, *folders(config_dir)[1:]]
     own_last = [file for folder in places for file in (folder / "sweeps").glob("*.yaml")]
@@ -61,7 +62,8 @@ def default_name(overrides: Sequence[str], study: str | None) -> str:
     """Return the name of a sweep for which ``sweep.name`` is not set.
 
     It depends on the sweep file and the overrides, but neither on tasks nor on seeds: a command
-    with more tasks or seeds extends the same sweep.
+    with more tasks or seeds extends the same sweep. The other keys in ``NOT_IN_A_NAME`` do not
+    count either.
 
     Args:
         overrides: overrides as typed.

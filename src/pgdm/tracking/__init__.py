@@ -22,7 +22,8 @@ class TrackingCfg:
     """``mlflow`` or ``none``."""
     uri: str | None
     """Tracking server or database, such as ``http://host:5000`` or ``sqlite:////data/mlflow.db``;
-    None: that of ``MLFLOW_TRACKING_URI``, else the file ``mlflow.db`` in the folder of runs."""
+    None: that of ``MLFLOW_TRACKING_URI``, else that of the run's sweep, else the file ``mlflow.db``
+    in the folder of runs."""
     experiment: str
     """MLflow experiment that groups the runs."""
 

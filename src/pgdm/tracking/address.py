@@ -86,7 +86,8 @@ def _folder(rest: str) -> str:
     if os.environ.get("MLFLOW_ALLOW_FILE_STORE", "").lower() in ("true", "1"):
         return Path(path).as_uri()
     raise ValueError(
-        f"MLflow no longer writes plain folders; a database in it is sqlite:///{path}/mlflow.db"
+        "MLflow no longer writes plain folders; for a database in that folder give "
+        f"sqlite:///{path}/mlflow.db"
     )
 
 

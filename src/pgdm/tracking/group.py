@@ -46,13 +46,19 @@ class Group:
         write_json(self.folder / LINK, {**link, "status": "running"})
 
     def adopt(self, run_dir: Path) -> None:
-        """Nest the run of a folder under this one, in the same store."""
+        """Have the MLflow run of a run folder nested under the group's, in the same store.
+
+        Only ``mlflow.json`` is written: the run's own tracker or ``pgdm runs sync`` reads it.
+        """
         run_dir.mkdir(parents=True, exist_ok=True)
         parent = {"run_id": self._link.get("run_id"), "uri": self.uri}
         write_json(run_dir / LINK, {**read_json(run_dir / LINK), PARENT: parent})
 
     def correct(self, run_dir: Path) -> None:
-        """Correct the MLflow status of a nested run that was killed, from its folder."""
+        """Correct the MLflow status of a nested run that was killed, from its folder.
+
+        If the folder shows the run as finished, missing records are added as well.
+        """
         folder = RunFolder(run_dir)
         status = folder.status()
         if not folder.parent() or status == "running":

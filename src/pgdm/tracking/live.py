@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 
 class MlflowTracker(Tracker):
-    """Mirrors a run from its own thread, so that training never waits for MLflow.
+    """Mirrors a run from a thread of its own: only ``finish`` waits for MLflow.
 
     Importing MLflow alone takes two seconds. A failure is reported once and retried later;
     ``pgdm runs sync`` adds from the run folder what is still missing at the end.
@@ -66,7 +66,7 @@ class MlflowTracker(Tracker):
             self._send()
 
     def video(self, path: Path, poster: Path, frames: int) -> None:
-        """Copy a video, and show its poster on the run's page; skip files removed by then."""
+        """Copy a video, and show its poster on the run's page; skip files that are gone by then."""
         self._videos.append((path, poster, frames))
         self._send()
 

@@ -25,14 +25,24 @@ METRICS = (
         "com_error_released",
         "both",
         "m",
-        "error as the released code computes it and the paper shows it: Frobenius norm divided by "
-        "T-1",
+        "error as the released code computes it and the paper shows it: Frobenius norm of the "
+        "differences from the targets, divided by T-1",
     ),
     Metric("ori_error", "both", "rad", "mean angle between object and target orientation"),
     Metric(
-        "lifted", "both", "0..1", "among steps with a raised target, the share with a raised object"
+        "lifted",
+        "both",
+        "0..1",
+        "of the steps whose target is 2 cm or more above the object's start, the share in which "
+        "the object is too",
     ),
-    Metric("dropped", "both", "0..1", "share of episodes that lifted the object and lost it again"),
+    Metric(
+        "dropped",
+        "both",
+        "0..1",
+        "share of episodes in which the object was lifted by 2 cm and later fell below that while "
+        "its target was above it",
+    ),
     Metric("length", "both", "steps", "control steps until the episode ended"),
     Metric(
         "return", "both", "reward", "sum of the task's rewards over an episode, without shaping"
@@ -40,7 +50,7 @@ METRICS = (
     Metric("shaping", "train", "reward", "sum of the rewards that shaping=... adds in training"),
     Metric("raw/<name>", "both", "-", "sum of a reward term over the episode, before weighting"),
     Metric("term/<name>", "both", "reward", "contribution of a weighted reward term to the return"),
-    Metric("end/<name>", "both", "0..1", "share of episodes that this termination ended"),
+    Metric("end/<name>", "both", "0..1", "share of episodes that the termination `<name>` ended"),
     Metric(
         "hand_error_m", "both", "m", "mean distance of fingertips from the expert's, over the steps"
     ),
@@ -55,7 +65,12 @@ METRICS = (
         "the object",
     ),
     Metric("diverged", "both", "0..1", "share of episodes that ended in a diverged simulation"),
-    Metric("<name>_std", "eval", "as `<name>`", "standard deviation over the sampled episodes"),
+    Metric(
+        "<name>_std",
+        "eval",
+        "as `<name>`",
+        "standard deviation over the episodes, if there are several",
+    ),
     Metric("episodes", "train", "episodes", "episodes that ended in the iteration"),
     Metric(
         "reward",

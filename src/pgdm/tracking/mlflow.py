@@ -73,7 +73,10 @@ def is_own(uri: str, folder: Path) -> bool:
 
 
 def environment() -> dict[str, str]:
-    """Return the environment for MLflow's processes, with its usage reports switched off."""
+    """Return the environment for MLflow's processes, with its usage reports switched off.
+
+    Variables that the user has set are kept.
+    """
     return {**_SETTINGS, **os.environ}
 
 
@@ -93,7 +96,7 @@ class Store:
         database, since two would corrupt it.
 
         Raises:
-            TrackingError: if another process holds the lock for minutes.
+            TrackingError: if another process holds the lock for two minutes.
         """
         file = sqlite_file(uri)
         with _only_one(file):
@@ -203,8 +206,9 @@ def _experiment(client: MlflowClient, name: str, file: Path | None) -> str:
 def find_run(store: Store, folder: RunFolder) -> Run | None:
     """Return the MLflow run that mirrors a folder, or None.
 
-    This is the run that ``mlflow.json`` names, unless the folder is a copy of another folder that
-    still exists; otherwise the newest run tagged with this folder and host.
+    This is the run that ``mlflow.json`` names, unless that run is deleted or in another store, or
+    the folder is a copy of another folder that still exists. Otherwise it is the newest run that is
+    tagged with this folder and host.
     """
     from mlflow.exceptions import MlflowException
 

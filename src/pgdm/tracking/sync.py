@@ -43,7 +43,7 @@ class Synced:
     folder: RunFolder
     action: str
     """``created``, ``completed``, ``rebuilt``, ``unchanged``, ``running``, ``unreadable``, or
-    ``failed``: its store cannot be used."""
+    ``failed``: MLflow cannot be used."""
     reason: str = ""
 
 
@@ -52,8 +52,9 @@ def sync(
 ) -> list[Synced]:
     """Make MLflow show every run below a folder as recorded in its run folder.
 
-    A second call changes nothing. A running run is left to its own process. If MLflow contradicts
-    a run's records, its MLflow run is moved to MLflow's trash and created again.
+    A second call changes nothing. A running run is left to its own process, unless MLflow does not
+    have it yet. If MLflow contradicts a run's records, its MLflow run is moved to MLflow's trash
+    and created again.
 
     Args:
         root: folder of runs.

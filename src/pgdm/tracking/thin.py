@@ -8,14 +8,14 @@ from pgdm.runs.folder import RunFolder
 from pgdm.runs.log import Record, metrics_of
 
 MAX_POINTS = 1500
-"""Maximum number of points of a metric, evaluations not counted."""
+"""Approximate maximum number of points of a metric, evaluations not counted."""
 
 Point = tuple[int, int, dict[str, float]]
 """Frames, time in ms since the epoch, and finite metrics by name."""
 
 
 class Thin:
-    """Passes at most ``MAX_POINTS`` points of a run, plus every evaluation.
+    """Passes about ``MAX_POINTS`` points of a run at most, plus every evaluation.
 
     Args:
         total_frames: the run's length, frames.
