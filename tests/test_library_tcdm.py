@@ -144,7 +144,10 @@ DAMAGE: dict[str, tuple[dict[str, Any], str]] = {
         {"object_orientation": np.ones((STEPS - 1, 4)) / 2},
         r"'object_orientation' has shape \(5, 4\), expected \(6, 4\)",
     ),
-    "length too large": ({"length": STEPS + 1}, "'length' is 7; valid: 2 to 6, the object poses"),
+    "length too large": (
+        {"length": STEPS + 1},
+        "'length' is 7; valid: a whole number from 2 to 6, the number",
+    ),
     "length zero": ({"length": 0}, "'length' is 0"),
     "length an array": ({"length": np.ones(2)}, r"'length' has shape \(2,\)"),
     "no length": ({"length": None}, "lacks 'length'"),

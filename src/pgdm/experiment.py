@@ -126,7 +126,7 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
 
 
 def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
-    """Return sentences on deviations from the settings, shaping, duration, disk and schedules."""
+    """Return sentences on shaping, duration, disk space, late schedules, and deviating settings."""
     late, days = builder.mdp.recipe.unfinished(cfg.total_frames), cfg.usual_days
     return [
         *builder.notes,

@@ -33,7 +33,7 @@ HOST = "127.0.0.1"
 START_S = 120.0
 _STOP_S = 5.0
 _VIEW = "pgdm"
-"""Name under which MLflow stores which columns the table of runs shows."""
+"""Key under which MLflow stores the choice of columns in the table of runs."""
 _COLUMNS = [
     "metrics.`eval_sampled/success`",
     "metrics.`train/steps_per_s`",
@@ -107,8 +107,9 @@ def _command(uri: str, root: Path, port: int) -> list[str]:
     # This interpreter has MLflow, whether its environment is activated or not.
     command = [sys.executable, "-m", "mlflow", "server", "--host", HOST, "--port", str(port)]
     command += ["--backend-store-uri", uri, "--workers", "1", "--no-serve-artifacts"]
-    # By default MLflow also accepts host names such as 10.evil.example. Its owner can resolve it
-    # to this machine (DNS rebinding), and the browser would let that site read the runs.
+    # By default MLflow also accepts host names such as 10.evil.example. Whoever owns such a name
+    # can make it resolve to this machine (DNS rebinding); the browser then lets their site read
+    # the runs.
     command += ["--allowed-hosts", ",".join((HOST, f"{HOST}:*", "localhost", "localhost:*"))]
     return [*command, "--default-artifact-root", str(root / ARTIFACTS)]
 

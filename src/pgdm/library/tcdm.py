@@ -1,4 +1,4 @@
-"""Filling the library from a checkout of TCDM, the paper authors' repository, or from its data."""
+"""Filling the library from a checkout of TCDM, the paper authors' repository, or from a part of it."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def import_tcdm(
     Args:
         path: the checkout, its ``tcdm`` package or its assets folder.
         root: the library.
-        progress: receives the number of files.
+        progress: receives the steps: models, their compilation, and tasks.
         replace: import even if tasks are lost that an earlier checkout provided.
 
     Raises:
@@ -178,7 +178,8 @@ def normalised(arrays: Mapping[str, Any], label: str) -> dict[str, np.ndarray]:
     length = float(motion_file.numbers(arrays, "length", label, ()))
     if length != int(length) or not 2 <= length <= len(rows):
         raise CorruptAssetError(
-            f"{label}: 'length' is {length:g}; valid: 2 to {len(rows)}, the object poses"
+            f"{label}: 'length' is {length:g}; valid: a whole number from 2 to {len(rows)}, the "
+            "number of poses"
         )
     steps = int(length)
     data_substeps = float(motion_file.numbers(arrays, "DATA_SUBSTEPS", label, ()))

@@ -1,4 +1,4 @@
-"""Searches hand poses around an object that do not touch it: pre-grasps for a task without any.
+"""Searches for hand poses near an object without contact: pre-grasps for a task that has none.
 
 A cross-entropy search over the hand's joints, started from several orientations of the base. It
 minimises, over poses h within the joints' limits,
@@ -37,8 +37,8 @@ from pgdm.sim.contact import FingertipDistance, HandContact
 from pgdm.sim.scene import Scene
 
 CLEARANCE_M = 0.003
-"""Distance between the hand and everything else that the search aims for. In returned poses it may
-be less, but the hand touches nothing else."""
+"""Distance that the search tries to keep between the hand and everything else. In returned poses it
+may be smaller, but the hand touches nothing but itself."""
 TIP_DISTANCE_M = 0.015
 """Desired distance of the fingertips from the object."""
 
@@ -67,7 +67,8 @@ class NearPose:
 
 
 Beyond = Callable[[np.ndarray], float]
-"""Maps qpos (nq,) to how far the base would exceed its range along the motion, m or rad."""
+"""Maps qpos (nq,) to the largest amount by which the base would leave its permitted range along the
+motion, m or rad."""
 
 
 def poses_near(
@@ -78,7 +79,7 @@ def poses_near(
     seed: int = 0,
     progress: StepProgress = silent,
 ) -> list[NearPose]:
-    """Search poses of the hand near the object; equal arguments give equal poses.
+    """Search for poses of the hand near the object; equal arguments give equal poses.
 
     Args:
         scene: scene of the task.
@@ -208,7 +209,7 @@ class _Search:
 
 
 class _Tendons:
-    """How far joints exceed the ranges of limited tendons: servos cannot bring them there.
+    """How far joints are outside the ranges of limited tendons, where servos cannot bring them.
 
     Args:
         model: a model; only fixed tendons count, whose length is a weighted sum of joint angles.

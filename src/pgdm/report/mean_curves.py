@@ -49,7 +49,8 @@ def over_tasks(tasks: Tasks, metric: str) -> tuple[Array, Array]:
 def compared(results: Results, rows: Sequence[Average]) -> Figure | None:
     """Draw a line for each row, a panel for each group; None if no group has a shared task.
 
-    Only tasks that all rows of a group share count; otherwise the lines would differ by task.
+    Each line averages only the tasks that every row of its group has; otherwise the lines would
+    be means over different tasks.
     """
     shade, panels = shades(rows), {}
     for group, own in by_group(rows).items():
@@ -93,7 +94,7 @@ def validated(results: Results, rows: Sequence[Average]) -> Figure | None:
 
 
 def _runs(results: Results, row: Average) -> dict[str, list[Run]]:
-    """Return the runs of each of a row's tasks that have a curve.
+    """Return the runs to average, for those of a row's tasks in which a run has a curve.
 
     These are the finished runs of a task or, if there are none, all that have not failed. A curve
     needs two evaluations.

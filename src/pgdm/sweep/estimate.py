@@ -51,7 +51,7 @@ def estimate(plan: Plan, root: Path, progress: StepProgress = silent) -> Estimat
     """
     done = []
     for job in plan.jobs:
-        progress("reading earlier runs", len(done), len(plan.jobs))
+        progress("reading the jobs' run folders", len(done), len(plan.jobs))
         done.append(_frames_done(job))
     left = [max(0, job.cfg.total_frames - d) for job, d in zip(plan.jobs, done, strict=True)]
     speeds = _speeds(plan, root)

@@ -51,9 +51,9 @@ class LocalCfg:
     max_jobs: int
     """Most jobs at a time; 0: as many as cores and memory allow."""
     cores_per_job: int
-    """Threads of a job that leaves ``num_threads`` at 0; 0: as many as the largest ``num_threads``
-    of the other jobs or, if all are 0, the cores divided by the jobs at a time. Unless ``max_jobs``
-    is set, the jobs at a time are at most the cores divided by this number."""
+    """Threads of each job whose ``num_threads`` is 0. If this is 0 too: the largest ``num_threads``
+    of any job or, if all are 0, an equal share of the cores. Unless ``max_jobs`` is set, the jobs
+    at a time are at most the cores divided by the resulting number."""
     memory_per_job_gb: float
     """Memory to allow for each job [GB]; not used if ``max_jobs`` is set."""
 

@@ -179,7 +179,7 @@ def _chosen(
         if len(with_it) != 1 or with_it[0] in found:
             raise ConfigError(
                 f"{label}: --fingers {human}={name} must name a link or joint of exactly one "
-                "finger that no other name refers to; the fingers' last links are "
+                "finger, and each finger only once; the fingers' last links are "
                 f"{_listed(_name(model, tip) for tip in tips)}"
             )
         found[with_it[0]] = human
@@ -193,7 +193,7 @@ def _chosen(
 
 
 def _by_words(names: set[str]) -> str | None:
-    """Return the human finger that most of a finger's names point to; None if none or a tie."""
+    """Return the human finger that the most names of a finger point to; None if none or a tie."""
     counts = {
         human: sum(any(_says(name.lower(), word) for word in words) for name in names)
         for human, words in _WORDS.items()
