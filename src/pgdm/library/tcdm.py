@@ -1,4 +1,4 @@
-"""Filling the library from a checkout of TCDM, the paper authors' repository, or from a part of it."""
+"""Filling the library from a checkout of TCDM, the paper authors' repository, or a part of it."""
 
 from __future__ import annotations
 
