@@ -54,7 +54,7 @@ def fetch(
         report = fetch_registry(paths.library(), offline, progress, rebuilt=experts)
     _print(report)
     index = open_library().experts()
-    print(f"{len(index.experts)} of them have an expert hand trajectory")
+    print(f"{len(index.experts)} tasks have an expert hand trajectory")
     for task, reason in index.left_out.items():
         print(f"no expert hand trajectory: {task}: {reason}")
 
@@ -100,7 +100,7 @@ def remove(
 ) -> None:
     """Delete a source.
 
-    All its files are deleted. Resuming or evaluating runs made with it requires it again.
+    All its files are deleted. Runs made with the source need it back to be resumed or evaluated.
     """
     _check_present(source)
     folder = paths.library() / source
@@ -149,7 +149,7 @@ def list_tasks() -> None:
 def verify() -> None:
     """Hash every file and list those that are damaged.
 
-    The exit code is 1 if there are any, or if the library is empty.
+    The exit code is 1 if a file is damaged or the library is empty.
     """
     library = open_library()
     files = sum(1 for _ in library.files())

@@ -40,7 +40,7 @@ _COLUMNS = [
     "tags.`task`",
     "tags.`seed`",
 ]
-"""Columns of the table, besides names and times, as MLflow's page names them."""
+"""Columns that the table shows besides names and times, written as MLflow's page writes them."""
 _DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # without a proxy
 _STOPPERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -125,7 +125,7 @@ def _served(command: list[str], output: IO[bytes]) -> Iterator[subprocess.Popen[
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            start_new_session=True,  # a new group: signals reach its workers, not this process
+            start_new_session=True,  # a new process group, which _kill ends as a whole
         )
         try:
             yield server
@@ -181,7 +181,7 @@ def _wait_until_up(server: subprocess.Popen[bytes], url: str, output: IO[bytes])
 
 
 def _page(url: str) -> str:
-    """Return the latest experiment's path below ``url``; if none, that of the experiment list."""
+    """Return the path of the latest experiment's page, or of the list if no experiment exists."""
     query = {"max_results": 100, "order_by": ["last_update_time DESC"]}
     found = _asked(f"{url}/api/2.0/mlflow/experiments/search", query).get("experiments", [])
     ours = [str(e["experiment_id"]) for e in found if e.get("name") != "Default"]

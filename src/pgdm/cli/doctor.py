@@ -36,7 +36,7 @@ class Check(NamedTuple):
 
 
 def diagnose() -> int:
-    """Print the table; return 1 if something that runs need by default does not work."""
+    """Print the table; return 1 if anything does not work that the default settings require."""
     table = Table(box=None, header_style="bold")
     for name in ("subject", "", "what was found, or what to do"):
         table.add_column(name, overflow="fold")

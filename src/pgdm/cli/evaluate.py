@@ -20,11 +20,12 @@ class EvalRequest:
     policy: PolicyRequest
     """Which policy."""
     episodes: int | None
-    """Sampled episodes, and deterministic ones if the task is randomised; None: as in the run."""
+    """Number of sampled episodes and, if the task is randomised, of deterministic ones; None: as in
+    the run."""
     video: bool
     """Whether to make a video of one deterministic episode as well."""
     deterministic: bool
-    """Whether to report only the policy's mean action."""
+    """Whether to evaluate only the policy's mean action."""
     seed: int | None
     """Seed of the action noise and the task's own randomness; None: the run's."""
     offline: bool

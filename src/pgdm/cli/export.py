@@ -30,9 +30,10 @@ class ExportRequest:
     form: str
     """``torchscript``, ``onnx``, ``safetensors`` or ``minari``."""
     out: Path | None
-    """File to write, or Minari's folder; None: named after the task, or ``datasets``."""
+    """File to write; None: a file named after the task. For ``minari``: folder of datasets; None:
+    ``datasets``."""
     scene: Path | None
-    """Folder for the scene, or None."""
+    """Folder to write the scene to; None: the scene is not written."""
     episodes: int
     """Only ``minari``: number of episodes."""
     deterministic: bool

@@ -329,8 +329,8 @@ def write_report(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder to write to [report/ in the first DIR, or in runs if that is an MLflow "
-            "experiment].",
+            help="Folder to write to [report/ in the first DIR, or in runs/ if the first DIR is an "
+            "MLflow experiment].",
             metavar="FOLDER",
         ),
     ] = None,

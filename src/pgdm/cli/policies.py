@@ -1,4 +1,4 @@
-"""Open the policy that a command names: of a run, a checkpoint, a file, or the zoo."""
+"""Open the policy that a command names, from a run, a checkpoint, a file or the zoo."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class PolicyRequest:
     """The policy that a command names."""
 
     text: str
-    """A run's folder, one of its checkpoints, a file as in ``POLICY_FILES``, or ``zoo:NAME``."""
+    """A run's folder, a checkpoint, a file with a suffix in ``POLICY_FILES``, or ``zoo:NAME``."""
     best: bool = False
     """Whether to take the best checkpoint of a run folder instead of the last."""
     task: str | None = None
@@ -36,8 +36,8 @@ def open_policy(request: PolicyRequest) -> TrainedPolicy:
     """Return the requested policy.
 
     Raises:
-        PgdmError: if the policy is missing or cannot be read, or an option does not apply to this
-            kind of policy or is missing.
+        PgdmError: if the policy is missing or cannot be read, or an option is missing or does not
+            apply to this kind of policy.
     """
     if request.text.startswith(PREFIX):
         if request.best or request.task or request.settings or request.vecnormalize:

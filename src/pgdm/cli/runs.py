@@ -90,7 +90,7 @@ Sort = Annotated[
 Limit = Annotated[
     int | None,
     typer.Option(
-        "--limit", "-n", min=1, help="List only the N largest or, sorted by time, latest."
+        "--limit", "-n", min=1, help="List only the N largest, or the N latest if sorted by time."
     ),
 ]
 
@@ -168,7 +168,7 @@ def row(folder: RunFolder, root: Path) -> dict[str, Any]:
 
     Args:
         folder: the run; if it cannot be read, its status is ``unreadable``.
-        root: the folder of runs, which the run's name is relative to.
+        root: the folder of runs; the run's name is its path relative to this folder.
     """
     base = {"run": _relative(folder, root), "modified": folder.modified()}
     try:
@@ -253,7 +253,7 @@ def _print(rows: list[dict[str, Any]]) -> None:
     console.print(Text.from_ansi(head))
     for line, values in itertools.zip_longest(lines, rows, fillvalue=None):
         console.print(Text.from_ansi(line or ""))
-        if values:  # not through rich, which would cut the name: it is copied into commands
+        if values:  # not through rich, which would cut the name; users copy it into commands
             print(f"  {values['run']}", flush=True)
 
 

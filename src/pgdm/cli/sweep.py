@@ -55,7 +55,7 @@ FRONT = Front(
     worker=worker.COMMAND,
     resume=(sys.executable, "-m", "pgdm", "sweep", "resume"),
 )
-"""What sweeps use from the command line: messages, a display, worker and resume commands."""
+"""How a sweep prints messages, shows its state, starts workers and is resumed in the background."""
 
 app = typer.Typer(help="Follow, stop and resume sweeps.", no_args_is_help=True)
 
@@ -176,7 +176,9 @@ def retry(folder: Folder, jobs: Jobs = None) -> None:
     chosen = [e for e in wanted if e.state == FAILED or (jobs and e.state != FINISHED)]
     chosen = [e for e in chosen if e.state != RUNNING]
     if not chosen:
-        print("no failed jobs" if not jobs else "nothing to retry: finished or running")
+        print(
+            "no failed jobs" if not jobs else "nothing to retry: these jobs are finished or running"
+        )
         return
     if parent(ledger) is not None:
         ledger.set_states({entry.key: WAITING for entry in chosen})
@@ -213,7 +215,7 @@ def settled(folder: Path, queue: Queue | None = None) -> Ledger:
 
 
 def _continues(found: Sequence[Row]) -> bool:
-    """Return whether jobs are running or waiting in Slurm, which needs no driving process."""
+    """Return whether jobs run or wait in Slurm, where they need no process to drive the sweep."""
     return any(row.slurm is not None and row.state in (WAITING, RUNNING) for row in found)
 
 

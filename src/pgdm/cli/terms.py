@@ -35,7 +35,7 @@ def setting_line(cfg: ExperimentCfg) -> str:
 
 
 def term_line(cfg: ExperimentCfg) -> str:
-    """Return rewards, without those of shaping, and terminations of a run on one line."""
+    """Return a run's rewards (without those of shaping) and terminations on one line."""
     rows = recipe(cfg.method).table()
     rewards = ", ".join(f"{name} {weight}" for kind, name, weight in rows if kind == "reward")
     ends = ", ".join(name for kind, name, _ in rows if kind == "termination")

@@ -56,7 +56,8 @@ class View:
 def view_task(view: View) -> None:
     """Replay the exemplar motion with the hand at its pre-grasp; nothing is simulated.
 
-    The object itself moves only if its tracked body has six joints; otherwise only its ghost does.
+    A translucent copy of the object shows the target. The object itself moves only if its tracked
+    body has six joints.
 
     Raises:
         PgdmError: if the task is unknown, its assets are missing, or nothing can be drawn.
@@ -114,8 +115,8 @@ def view_expert(view: View) -> None:
     if motion not in MOCAP_TASKS:
         hint = "Only motion-capture tasks have one."
         raise UnknownNameError("expert hand trajectory", motion, MOCAP_TASKS, hint)
-    # The recorded poses are those of the mesh's origin; without the correction of the reference the
-    # fingers would not touch the object where the person's did.
+    # The recorded poses are those of the mesh's origin. Without reference=com_corrected the fingers
+    # would not touch the object where the person's fingers did.
     builder = view.open("method=graff", "pregrasp=mined", "reference=com_corrected")
     scene, mdp, expert = builder.scene, builder.mdp, builder.expert
     assert expert is not None and mdp.expert is not None  # the method needs one

@@ -20,8 +20,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Work on a job, and return the exit code of its run.
 
     Args:
-        argv: folder of the sweep, key of the job, number of the attempt, threads for a job whose
-            settings do not fix them and, under Slurm, the ID of the Slurm job.
+        argv: folder of the sweep, key of the job, number of the attempt, number of threads (used if
+            the job's settings fix none) and, under Slurm, the ID of the Slurm job.
     """
     folder, key, number, threads, *slurm = sys.argv[1:] if argv is None else argv
     slurm_id = slurm[0] if slurm else None

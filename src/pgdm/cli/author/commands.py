@@ -60,8 +60,8 @@ def make_object(
     threshold: Annotated[
         float,
         typer.Option(
-            help="Concavity that may remain, relative to the size, 0.01 to 1; lower gives more "
-            "parts."
+            help="Concavity that may remain, as a fraction (0.01 to 1) of the object's size; lower "
+            "gives more parts."
         ),
     ] = 0.05,
     licence: Annotated[
@@ -111,8 +111,8 @@ def make_hand(
     reset: Annotated[
         list[str] | None,
         typer.Option(
-            help="Joints in the reset pose, rad or m: JOINT=POSITION,... [zero, or the limit "
-            "nearest to zero].",
+            help="Joint positions in the reset pose, rad or m: JOINT=POSITION,... [zero, or the "
+            "limit nearest to zero].",
             metavar="LIST",
         ),
     ] = None,
@@ -158,8 +158,8 @@ def make_hand(
 ) -> None:
     """Make a hand from MJCF or URDF.
 
-    The hand gets six base joints, a position servo for each joint that is not coupled to another,
-    tracked points, a reset pose and a mean hand; it is checked and drawn to picture.png in its
+    The hand gets six base joints, tracked points, a reset pose, a mean hand, and a position servo
+    for each joint that is not coupled to another; it is checked and drawn to picture.png in its
     folder.
     """
     shipped = [path.stem for path in (conf_dir() / "hand").glob("*.yaml")]
@@ -216,9 +216,9 @@ def make_task(
     pregrasp: Annotated[
         str,
         typer.Option(
-            help="mean or open: search for a pose near the object with fingers close to the mean "
-            "or the open hand; TASK: with fingers close to that task's pre-grasp; FILE.npz: this "
-            "pre-grasp; later: none yet.",
+            help="mean, open or TASK: search for a pose near the object, with fingers close to the "
+            "mean hand, the open hand or that task's pre-grasp; FILE.npz: use this pre-grasp; "
+            "later: make the task without one.",
             metavar="WHICH",
         ),
     ] = "mean",
@@ -244,7 +244,7 @@ def make_task(
     """
     own.check_task_name(task, suites(), replace)
     library = open_library()
-    # If the library is empty, ``run`` fills it first, since it provides the hands and the table.
+    # If the library, which provides the hands and the table, is empty, ``run`` fills it first.
     if library.is_filled:
         check_name("object", object_name, library.objects())
     with loading():

@@ -93,7 +93,7 @@ def _found(made: AuthoredHand) -> list[tuple[str, str]]:
     rows = [
         ("side", made.side),
         ("fingers", f"{fingers}; found by {found.found_by}"),
-        ("wrist", f"{len(found.wrist_joints)} joints move the palm"),
+        ("wrist", f"joints that move the palm: {len(found.wrist_joints)}"),
         ("servos", f"gain {', '.join(f'{g:g}' for g in gains)}; {given} with the file's gain"),
         ("reset", f"all joints at zero{f', but {moved}' if moved else ''}"),
     ]

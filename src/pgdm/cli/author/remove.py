@@ -33,5 +33,5 @@ def run(name: str, sure: bool) -> None:
         from pgdm.author.task import remove_task  # imported here because it loads torch
 
         if (aside := remove_task(name)) is not None:
-            print(f"its pre-grasps are kept in {aside}")
+            print(f"the task's pre-grasps are kept in {aside}")
     print(f"removed the {kind} '{name}'")

@@ -76,7 +76,7 @@ def _draw(made: AuthoredTask, path: Path) -> str:
 
 
 def film_panels(made: AuthoredTask) -> list[Panel]:
-    """Return pictures of the motion, the hand moving rigidly with the object (zero residuals)."""
+    """Return pictures of the motion; the hand moves rigidly with the object (zero residuals)."""
     poses, scene = made.motion.poses, made.scene
     reference = ObjectReference(torch.from_numpy(poses.pos), torch.from_numpy(poses.quat))
     qpos = motion_qpos(scene, made.pregrasp.qpos, reference)

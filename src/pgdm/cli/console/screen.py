@@ -64,7 +64,7 @@ def fits(console: Console, table: Table) -> bool:
 
 
 def notify(text: str) -> None:
-    """Print a note to stderr, such as that something takes time or deviates from the request."""
+    """Print a note to stderr, for example on what takes time or deviates from the request."""
     SCREEN.print(text, markup=False, highlight=False, soft_wrap=True)
 
 

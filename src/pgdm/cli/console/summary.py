@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from pgdm.experiment import RunResult
 
 PAPER_START = "planned"
-_NOT_PAPER = ("seed", "pregrasp", "eval.episodes")  # shown elsewhere, or irrelevant here
+# Settings that the caption does not list as deviations: shown elsewhere, or irrelevant here.
+_NOT_PAPER = ("seed", "pregrasp", "eval.episodes")
 _SHOWN_CHANGES = 4
 
 

@@ -102,7 +102,7 @@ def span(seconds: float) -> str:
 
 
 def failures(found: Sequence[Row]) -> str:
-    """Return the failed jobs as a table and the end of each log; empty if there are none."""
+    """Return a table of the failed jobs and the end of each one's log; empty if none failed."""
     failed = [row for row in found if row.state == FAILED]
     if not failed:
         return ""

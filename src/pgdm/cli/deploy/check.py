@@ -26,7 +26,7 @@ def run_check(file: Path) -> int:
 
 
 def describe(file: Path, playback: Playback, used: limits.Usage) -> None:
-    """Print a playback's content, its share of the arm's limits, and its worst violations."""
+    """Print a playback's content, how much of the arm's limits it uses, and all violations."""
     say = partial(console().print, soft_wrap=True, markup=False, highlight=False)
     count, hand = len(playback.time_s), len(playback.hand_joints)
     task = playback.facts.get("task", "no task")
@@ -39,9 +39,7 @@ def describe(file: Path, playback: Playback, used: limits.Usage) -> None:
     for violation in used.violations:
         say(f"violation: {violation.described}")
     if used.violations and used.slower < 1:
-        say(
-            f"at {used.slower:.2f} of this speed, velocity, acceleration and jerk are within limits"
-        )
+        say(f"velocity, acceleration and jerk are within limits at {used.slower:.2f} of this speed")
 
 
 def _joint(share: np.ndarray) -> str:

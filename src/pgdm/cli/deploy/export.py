@@ -51,7 +51,7 @@ class Place:
 def run_export(request: ExportRequest, cfg: ConvertCfg, place: Place) -> int:
     """Write the playback and print how much of the arm's limits it uses; return the exit code.
 
-    The code is 1 if the arm cannot play it, even if it is written anyway.
+    The code is 1 if the arm cannot play the playback, even if the file is written anyway.
 
     Raises:
         PgdmError: if a setting is wrong, the run is damaged, its policy loses the object in all

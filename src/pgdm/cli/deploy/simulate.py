@@ -102,7 +102,7 @@ def _print(outcome: Outcome) -> None:
             f"held objects end {100 * np.mean(high):.1f} cm above start ({100 * high.min():.1f} to "
             f"{100 * high.max():.1f}); in the exported episode {100 * outcome.expected_m:.1f} cm"
         )
-    say(f"above {100 * LIFTED_M:.0f} cm for {outcome.lifted_s.mean():.2f} s on average")
+    say(f"time above {100 * LIFTED_M:.0f} cm: {outcome.lifted_s.mean():.2f} s on average")
     degrees = np.degrees(outcome.arm_error_rad.max())
     say(f"largest lag of an arm joint behind its command: {degrees:.2f} degrees")
     if outcome.diverged.any():

@@ -125,7 +125,7 @@ def _rows(
 
 
 def _stored(scene: Scene, motion: Motion, sources: Sequence[str]) -> list[_Checked]:
-    """Return a task's pre-grasps for this hand; the user's replace the library's of equal source.
+    """Return a task's pre-grasps for a hand, one for each source: the user's or else the library's.
 
     Raises:
         ConfigError: if one of the sources is missing, or there is no pre-grasp at all.
@@ -158,7 +158,7 @@ def _stored(scene: Scene, motion: Motion, sources: Sequence[str]) -> list[_Check
 
 
 def _own(own: Pregrasp, path: Path | None) -> _Checked:
-    """Return a pre-grasp of the user's: where its plan ends if ``planned``, else its pose."""
+    """Return a pre-grasp of the user's: for ``planned`` the end of its plan, otherwise its pose."""
     source = path.stem if path is not None else ""
     start = own.start if source == "planned" else own.pose
     plan = None if own.reached is None else own.reached.actions

@@ -76,7 +76,7 @@ def check(
     ] = None,
     hand: Hand = None,
     reach: Annotated[
-        bool, typer.Option("--reach", help="Plan a reach to pre-grasps that have none.")
+        bool, typer.Option("--reach", help="Plan a reach to pre-grasps without a stored plan.")
     ] = False,
     policies: Annotated[
         int, typer.Option(min=1, help="Number of random closing policies in the lift test.")
@@ -155,7 +155,8 @@ def teleop(
 ) -> None:
     """Cut a pre-grasp from a demonstration (pregrasp=teleop).
 
-    The pre-grasp is the pose just before the hand takes hold: touches something for 0.2 s or more.
+    The pre-grasp is the pose just before the hand takes hold, that is, before its first contact
+    that lasts 0.2 s or more.
     """
     with loading():
         from pgdm.cli.pregrasp.teleop import run
@@ -182,8 +183,8 @@ def label(
             "--from",
             metavar="POSE",
             help="Pose to start from: mined, planned, learned, mocap, teleop, labeled, mean, open, "
-            "none (reset pose), or a pre-grasp's FILE; by default your draft, else the first of "
-            "labeled, planned, mined, mocap and none that exists.",
+            "none (reset pose), or a pre-grasp's FILE; by default your draft, else the first that "
+            "exists of labeled, planned, mined, mocap and none.",
         ),
     ] = None,
     port: Annotated[

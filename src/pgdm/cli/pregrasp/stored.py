@@ -39,7 +39,7 @@ def report(path: Path, scene: Scene) -> None:
 
 
 def report_with_reach(path: Path, image: Path | None, pregrasp: Pregrasp, scene: Scene) -> None:
-    """Print a pre-grasp's reach and file; draw its pose and reach's end if ``image`` is given."""
+    """Print a pre-grasp's reach and file; if ``image`` is given, draw its pose and plan's end."""
     reach = pregrasp.note.get("reach")
     if reach:
         print(

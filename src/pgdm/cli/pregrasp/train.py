@@ -64,7 +64,7 @@ def _describe(predictor: Predictor, poses: int) -> list[str]:
     ]
     if objects < _FEW_OBJECTS:
         lines.append(
-            f"{objects} objects are very few: expect little more than a mean hand. Pre-grasps that "
+            f"very few objects ({objects}): expect little more than a mean hand. Pre-grasps that "
             "you label or retarget for this hand are added to the data"
         )
     return lines
