@@ -136,7 +136,7 @@ def list_tasks() -> None:
             ", ".join(entry.starts), _expert_kind(experts.get(task)),
         )  # fmt: skip
     table.caption = (
-        f"{len(served)} tasks in {paths.library()}; a task is read from the first source listed\n"
+        f"{len(served)} tasks in {paths.library()}; a task is read from the first of its sources\n"
         "expert: whether a human hand trajectory is stored; 'pgdm assets show TASK' prints details"
     )
     tables().print(table)

@@ -85,7 +85,7 @@ def _machine() -> Iterator[Check]:
     enough = free >= ENOUGH_GB
     yield Check("memory", enough, f"{free:.1f} GB are free" if enough else cure)
     disk = shutil.disk_usage(_existing(paths.library())).free / 1e9
-    yield Check("disk", disk > 1, f"{disk:.1f} GB are free (needed: over 1) in {paths.library()}")
+    yield Check("disk", disk > 1, f"{disk:.1f} GB are free in {paths.library()} (needed: over 1)")
     if torch.cuda.is_available():
         yield Check("GPU", True, f"{torch.cuda.get_device_name()}: used with device=cuda")
     else:

@@ -25,7 +25,7 @@ class EvalRequest:
     video: bool
     """Whether to make a video of one deterministic episode as well."""
     deterministic: bool
-    """Whether to evaluate only the policy's mean action."""
+    """Whether to report only the episodes with the policy's mean action."""
     seed: int | None
     """Seed of the action noise and the task's own randomness; None: the run's."""
     offline: bool

@@ -285,7 +285,7 @@ def view(
         bool, typer.Option("--wrist", help="Play the wrist plan: the hand alone, no object.")
     ] = False,
     ablations: Annotated[
-        bool, typer.Option("--ablations", help="Show the start under each ablation instead.")
+        bool, typer.Option("--ablations", help="Show the start under each ablation, no motion.")
     ] = False,
     image: Annotated[
         Path | None,

@@ -55,7 +55,7 @@ FRONT = Front(
     worker=worker.COMMAND,
     resume=(sys.executable, "-m", "pgdm", "sweep", "resume"),
 )
-"""How a sweep prints messages, shows its state, starts workers and is resumed in the background."""
+"""How a sweep prints messages, shows its state, starts workers and continues in the background."""
 
 app = typer.Typer(help="Follow, stop and resume sweeps.", no_args_is_help=True)
 
@@ -168,8 +168,8 @@ def cancel(folder: Folder, jobs: Jobs = None) -> None:
 def retry(folder: Folder, jobs: Jobs = None) -> None:
     """Retry failed jobs.
 
-    Named jobs are retried whatever their state, unless running or finished. If a process already
-    drives the sweep, that process starts the jobs; otherwise this command does, and waits for them.
+    Named jobs are retried unless they are running or finished. If a process already drives the
+    sweep, that process starts the jobs; otherwise this command does, and waits for them.
     """
     ledger = settled(folder)
     wanted = _chosen(ledger, jobs)

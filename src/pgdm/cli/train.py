@@ -74,9 +74,9 @@ def resume_run(
         run: the run's folder, or a file in it.
         total_frames: new length; None: as before.
         time_limit_min: new limit, min; None: as before, 0: no limit.
-        uri: MLflow store to mirror the run to; None: that of ``MLFLOW_TRACKING_URI`` or the one
-            next to the run. The store named in the folder's settings is not used, since somebody
-            else may have made the folder.
+        uri: MLflow store to mirror the run to; None: the one in ``MLFLOW_TRACKING_URI``, else
+            the one next to the run. The store named in the folder's settings is not used, since
+            somebody else may have made the folder.
         offline: whether missing assets are an error instead of being fetched.
 
     Raises:

@@ -39,8 +39,8 @@ def list_policies(place: Place = None) -> None:
 
     zoo = Zoo(place)
     table = Table(
-        caption="success of sampled actions and of the mean action; error of sampled actions "
-        "(released form, m)"
+        caption="success and error (released form, m) of sampled actions; no noise: success of the "
+        "mean action"
     )
     for head in ("name", "task", "hand", "method", "algo", "action", "seed", "frames"):
         table.add_column(head, no_wrap=True)

@@ -1,4 +1,4 @@
-"""``pgdm author task``: make a task from an object, a hand and a motion, print and draw it."""
+"""``pgdm author task``: make a task from an object, a hand and a motion; print and draw it."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class ProgressView(callback.Callback):
         for kind in ("sampled", "deterministic"):
             success = metrics.get(f"eval_{kind}/success", math.nan)
             lifted = metrics.get(f"eval_{kind}/lifted", math.nan)
-            # Where the motion never rises there is nothing to lift.
+            # If the motion never rises, nothing can count as lifted.
             held = f", lifted {lifted:.0%}" if math.isfinite(lifted) else ""
             parts.append(f"{kind} success {success:.1%}{held}")
         self._print(f"evaluation at {progress.frames:,} frames: {'; '.join(parts)}")

@@ -1,4 +1,4 @@
-"""A finished run in one table: before, after, and the paper's values."""
+"""A finished run in one table: results before and after training, and the paper's values."""
 
 from __future__ import annotations
 

@@ -158,6 +158,6 @@ def live_table(name: str, found: Sequence[Row], summary: Summary) -> Group:
                 percent(row.success),
                 _UNKNOWN if row.left_s is None else span(row.left_s),
             )
-    whole = Table.grid()  # ends the line, which a bar alone does not
+    whole = Table.grid()  # a grid ends the line; a bar alone would not
     whole.add_row(ProgressBar(summary.total_frames, summary.frames, width=40))
     return Group(table, whole, Text(summary_line(name, summary)))

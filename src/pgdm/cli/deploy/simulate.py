@@ -1,4 +1,4 @@
-"""``pgdm deploy simulate``: play a playback on a simulated arm and hand; print and film it."""
+"""``pgdm deploy simulate``: play a playback on a simulated arm and hand; film it, print results."""
 
 from __future__ import annotations
 

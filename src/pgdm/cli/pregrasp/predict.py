@@ -27,7 +27,7 @@ def run(
     image: Path | None,
     offline: bool,
 ) -> None:
-    """Predict a pre-grasp, store it, and print its candidates.
+    """Predict a pre-grasp, store it, and print the candidates.
 
     Raises:
         PgdmError: task, hand or weights are unknown, damaged or do not fit each other, or no
