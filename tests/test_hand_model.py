@@ -179,7 +179,7 @@ def test_the_reset_pose_is_that_of_the_keyframe() -> None:
 
 def test_the_objects_joints_come_after_the_hands() -> None:
     xml = XML.replace(OBJECT, "").replace('<body name="h/arm">', f'{OBJECT}<body name="h/arm">')
-    with pytest.raises(SceneError, match="joint 'fall' is not the hand's, whose joints must come"):
+    with pytest.raises(SceneError, match="joint 'fall' is not the hand's; the hand's must come"):
         actuators(xml)
 
 

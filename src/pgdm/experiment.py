@@ -104,8 +104,8 @@ def foreseen(cfg: ExperimentCfg, library: Library) -> list[str]:
     If assets must be fetched or a start state computed first, return only a note about that.
 
     Raises:
-        ConfigError: if its start state is missing and would not be computed, there is no such hand,
-            or too little memory is free.
+        ConfigError: if the run's start state is missing and would not be computed, its hand is
+            unknown, or too little memory is free.
         SceneError: if the scene does not compile, or the hand violates pgdm's assumptions.
     """
     task = cfg.task.motion

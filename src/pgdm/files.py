@@ -45,7 +45,7 @@ MOST_TEXT_BYTES = 1 << 22
 MOST_DEPTH = 50
 """Deepest nesting of YAML, and of folders that are searched."""
 MOST_NODES = 100_000
-"""Largest number of values in a YAML file, counting those that aliases repeat each time."""
+"""Largest number of values in a YAML file; each alias counts as all the values it repeats."""
 # What torch.load raises for bad files; its messages, which advise turning `weights_only` off, are
 # replaced.
 _TORCH_ERRORS = (

@@ -26,7 +26,7 @@ def free_bytes() -> int:
 
 
 def check_fits(what: str, needed_bytes: float, cure: str) -> None:
-    """Check that something fits into the free memory, before Linux kills the process for it.
+    """Check that something fits into the free memory; if it did not, Linux would kill the process.
 
     Args:
         what: what needs the memory: the setting with its value.

@@ -88,8 +88,8 @@ def check_path_part(kind: str, name: object) -> None:
         name: the name.
 
     Raises:
-        ConfigError: if it is not a letter, digit or ``_``, followed by up to 99 of these, ``.``,
-            ``+`` and ``-``.
+        ConfigError: if it is not 1 to 100 letters, digits, ``_``, ``.``, ``+`` and ``-``, of which
+            the first is a letter, a digit or ``_``.
     """
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         shown = repr(name) if len(repr(name)) <= 60 else f"{name!r:.57}..."

@@ -30,10 +30,11 @@ MOUNTS = {
     # Puts the rear end of the forearm's mesh, 0.213 m from its origin, on the flange.
     "adroit": (0.0, 0.0, -0.213, 0.0, 0.0, 0.0),
 }
-"""Default mounts by hand, see `Setup.mount`."""
+"""Default mount of each hand, see `Setup.mount`."""
 
 PLACES = {"dmanus": (0.2, -0.75, 90.0), "adroit": (0.2, -1.0, 90.0)}
-"""Default places of the arm by hand, see `Setup.arm_at`; Adroit's long forearm needs more room."""
+"""Default place of the arm for each hand, see `Setup.arm_at`; Adroit's long forearm needs more
+room."""
 
 
 @dataclass(frozen=True)
@@ -156,8 +157,9 @@ class ArmIk:
     def _merit(self, path: ArmPath) -> tuple[float, float]:
         """Return a path's merit, a pair compared in order.
 
-        First minus its largest error, m, rounded to 1 mm; 1 rad counts as 0.1 m. Then the least
-        distance from a limit, at most 0.3 rad, minus the excess of the largest jump over 0.3 rad.
+        The first number is the path's largest error in m, rounded to 1 mm and negated; an error of
+        1 rad counts as 0.1 m. The second is the least distance from a limit, at most 0.3 rad, minus
+        the amount by which the largest jump exceeds 0.3 rad.
         """
         low, high = POSITION_RAD.T
         room = float(np.minimum(path.joints - low, high - path.joints).min())

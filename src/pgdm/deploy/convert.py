@@ -32,7 +32,7 @@ class ConvertCfg:
     The base follows its targets like a soft spring, the arm follows closely. A policy may
     exaggerate targets to overcome the spring's lag; the arm would then move too far."""
     smooth_s: float = 0.04
-    """Standard deviation of the Gaussian that smooths commands, s of the rollout."""
+    """Standard deviation of the Gaussian that smooths commands, in the rollout's time, s."""
     hold_s: float = 1.0
     """How long the last command is held, s."""
     rate_hz: float = 100.0

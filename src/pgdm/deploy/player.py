@@ -52,7 +52,7 @@ def check_playable(playback: Playback) -> None:
     if used.violations:
         raise ConfigError(
             f"the arm cannot play this: {used.violations[0].described}; 'pgdm deploy check' lists "
-            "the worst violation by each joint of each limit; 'pgdm deploy export --speed 0.5' "
+            "each joint's worst violation of each limit; 'pgdm deploy export --speed 0.5' "
             "makes a slower playback"
         )
 

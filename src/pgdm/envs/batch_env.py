@@ -120,7 +120,7 @@ class BatchEnv:
         return self._obs
 
     def step(self, action: Tensor) -> StepResult:
-        """Take one control step with actions (N, A) in [-1, 1], clipped to it.
+        """Take one control step with actions (N, A), which are clipped to [-1, 1].
 
         Returns:
             obs (N, D) float32, for restarted rows the first after the restart; reward (N,) float32;

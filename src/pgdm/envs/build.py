@@ -191,7 +191,7 @@ class EnvBuilder:
         return facts
 
     def differences(self, recorded: Mapping[str, Any]) -> Iterator[str]:
-        """Yield a text for each fact of this environment that a run recorded otherwise or lacks."""
+        """Yield a text for each of the `facts` that a run lacks or recorded with another value."""
         for key, now in self.facts().items():
             if recorded.get(key) != now:
                 text = f"{key} '{recorded.get(key)}', and the library now has '{now}'"

@@ -26,7 +26,7 @@ class FinishedEpisodes:
     recipe: Recipe
     episodes: Episodes
     sums: Tensor  # (2, K, k) sum of each reward term over the episode: weighted, then raw
-    measured: Tensor  # (2, M, k) sum of each measure over the steps where it applies, their number
+    measured: Tensor  # (2, M, k) each measure's sum over the steps where it applies, their number
     flags: Tensor  # (1 + E, k) bool: diverged, then each of the recipe's ends
 
     def metrics(self) -> dict[str, Tensor]:

@@ -75,8 +75,8 @@ def film_clip(clip: Clip, fps: int, path: Path, progress: StepProgress = silent)
         clip: what to show.
         fps: frames per second.
         path: path of the MP4.
-        progress: called before OpenGL is opened, with the number of frames drawn so far, and before
-            the video is encoded.
+        progress: called before OpenGL is opened, after each frame (with the number of frames before
+            it), and before the video is encoded.
 
     Raises:
         RenderError: if no OpenGL works here or the file cannot be written.

@@ -24,8 +24,8 @@ class PgdmEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Observations are float32 (D,) in the chosen layout, actions float32 (A,) in [-1, 1].
     ``terminated``: the object was lost or the motion ended; ``truncated``: the simulation
-    diverged. ``info`` holds ``object_error_m`` (m), ``success`` (the step is within the
-    threshold) and, when an episode ends, ``episode_metrics``.
+    diverged. ``info`` holds ``object_error_m`` (m), ``success`` (whether that error is
+    within the threshold) and, when an episode ends, ``episode_metrics``.
 
     Args:
         batch: the task with one simulation and ``auto_reset=False``.

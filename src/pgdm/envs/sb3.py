@@ -39,7 +39,7 @@ class PgdmVecEnv(VecEnv):
     def reset(self) -> np.ndarray:
         """Restart all simulations; return observations (N, D).
 
-        A seed passed to ``seed`` before reseeds the randomisation, in tasks that have it.
+        A seed given to ``seed`` restarts the randomisation here, in tasks that have it.
         """
         if (seed := self._seeds[0]) is not None:
             self.batch.reseed(seed)

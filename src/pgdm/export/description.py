@@ -34,8 +34,8 @@ def description(policy: TrainedPolicy, builder: EnvBuilder) -> dict[str, Any]:
     Positions are in the world frame; m, rad, s; quaternions wxyz. ``T`` is the number of poses of
     the exemplar motion, ``t`` the control steps since reset.
 
-    - ``observation``: its parts in order, each with ``name``, ``first``, ``size``, ``unit``, and
-      ``of``, the joints, geoms or bodies that it describes;
+    - ``observation``: its parts in order, each with ``name``, ``first``, ``size``, ``unit`` and
+      ``of`` (the joints, geoms or bodies that the part describes);
     - ``observation_by_step``: (T, K) the last K numbers of the observation at each t;
     - ``points``, ``object``: geoms of the hand's points, and the tracked body;
     - ``action``: for the hand's driven ``joints``, first clipped to [-1, 1]; then
@@ -43,9 +43,9 @@ def description(policy: TrainedPolicy, builder: EnvBuilder) -> dict[str, Any]:
       first ``len(low)`` joints are instead
       ``clip(path[min(t + lead_steps, T-1)] + largest * action, low, high)``;
     - ``actuators``: names, in the order of MuJoCo's ``ctrl``;
-    - ``control``: ``timestep_s`` of a physics step, and ``substeps`` per control step; during a
-      control step the first ``compensated_joints`` joints of ``qvel`` get as applied force the
-      ``qfrc_bias`` of the step's start;
+    - ``control``: ``timestep_s`` of a physics step, and ``substeps`` per control step. At the start
+      of a control step, copy the first ``compensated_joints`` entries of ``qfrc_bias`` to
+      ``qfrc_applied``, where they stay for all substeps;
     - ``start``: the start state; ``episode``: the exemplar motion, the object errors up to
       which a step is a success and from which the object is lost, and the terminations' names.
     """

@@ -37,7 +37,7 @@ class PolicyGraph(nn.Module):
     def __init__(self, policy: TrainedPolicy, builder: EnvBuilder) -> None:
         super().__init__()
         self.network, self.actions = policy.network, builder.mdp.actions
-        order = np.argsort(builder.scene.index.actuators)  # by actuator: its driven joint
+        order = np.argsort(builder.scene.index.actuators)  # each actuator's entry of the action
         self.register_buffer("inverse", torch.from_numpy(order))
 
     def forward(self, observation: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:

@@ -37,7 +37,7 @@ class ActionCfg:
     `pgdm.wrist.path`)."""
     hold_steps: int
     """Only ``planned``: control steps for which the hand stays at its pre-grasp while the fingers
-    close; it catches up with the motion in as many steps."""
+    close. The hand then catches up with the motion in as many steps."""
 
     carry_load: bool
     """Only ``planned``: whether the commands compensate for the object's weight once the motion

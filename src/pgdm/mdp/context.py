@@ -70,13 +70,13 @@ class StepContext:
 
     @cached_property
     def contact_points(self) -> Tensor:
-        """The expert's contact points on the object in its current pose, (n, F, 3) m."""
+        """The expert's contact (or closest) points on the object where it is now, (n, F, 3) m."""
         s = self.state
         return self._expert.contact_points(self.t, s.object_pos, s.object_quat)
 
     @cached_property
     def contact_distance(self) -> Tensor:
-        """Distance of each fingertip from the expert's contact or closest point, (n, F) m."""
+        """Distance of each fingertip from its point in ``contact_points``, (n, F) m."""
         return torch.linalg.vector_norm(self.contact_points - self.fingertips, dim=-1)
 
     def hand_error(self, space: str, form: str) -> Tensor:

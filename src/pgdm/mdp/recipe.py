@@ -83,7 +83,7 @@ class Recipe:
                 if not isinstance(term, kind):
                     raise ConfigError(f"a recipe has {term!r} where a {kind.__name__} is needed")
             names = [term.name for term in terms]
-            for name in names:  # MLflow would reject others, after hours of training
+            for name in names:  # MLflow would reject an invalid one, after hours of training
                 check_path_part(f"name of a {kind.__name__}", name)
             twice = next((name for name in names if names.count(name) > 1), None)
             if twice is not None:

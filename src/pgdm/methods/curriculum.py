@@ -16,7 +16,7 @@ class RampCfg:
     """How the tracking term's weight grows."""
 
     ramp_frames: int
-    """Environment steps over all simulations in which the weight grows linearly from 0."""
+    """Duration of the weight's linear growth from 0, environment steps over all simulations."""
 
     def validate(self) -> None:
         """Check the numbers.

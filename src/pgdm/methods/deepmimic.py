@@ -25,7 +25,8 @@ class ImitationCfg:
     space: str
     """h: ``fingertips`` (positions, m) or ``joints`` (all joints of the hand, m and rad)."""
     form: str
-    """d: ``squared``, |h - h_expert|^2 (published appendix); ``norm``, its root (earlier text)."""
+    """d: ``squared``, |h - h_expert|^2 (published appendix); ``norm``, its root (an earlier version
+    of the paper)."""
     weight: float
     """lambda_3, weight of the term."""
     scale: float

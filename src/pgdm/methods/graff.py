@@ -1,6 +1,6 @@
 """GRAFF*: PGDM's terms plus a reward for fingertips at the expert's contacts (paper, App. D).
 
-Adds to the reward lambda times the mean of exp(-eta d) over the expert's fingers in contact, with
+Adds a reward: lambda times the mean of exp(-eta d) over the expert's fingers in contact, with
 d = |c - f|^2 or |c - f| for a fingertip at f and the expert's contact point c on the object, in m.
 """
 
@@ -23,7 +23,8 @@ class ContactCfg:
     """How fingertips at the expert's contact points are rewarded."""
 
     form: str
-    """d: ``squared``, |c - f|^2 (published appendix); ``norm``, |c - f| (earlier version)."""
+    """d: ``squared``, |c - f|^2 (published appendix); ``norm``, |c - f| (an earlier version of the
+    paper)."""
     weight: float
     """lambda, weight of the term."""
     scale: float

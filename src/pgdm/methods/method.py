@@ -51,7 +51,7 @@ def _imported(name: str) -> Method:
     except ImportError as error:
         found = error.name is None or not f"{module_name}.".startswith(f"{error.name}.")
         cure = (
-            "the module exists, but something it imports does not: correct it"
+            "the module exists, but something it imports does not: correct that import"
             if found
             else "install its package, or add its folder to PYTHONPATH"
         )

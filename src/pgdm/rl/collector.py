@@ -49,8 +49,8 @@ class RolloutCollector(BaseCollector):
         policy: reads ``observation`` (N, D), writes ``action`` (N, A). It is not copied, so a
             training loop that changes its weights in place needs no `update_policy_weights_`.
         frames_per_batch: N * T, environment steps in a rollout.
-        total_frames: environment steps after which iteration stops; the last rollout is always
-            complete, so it may exceed them. -1: unlimited.
+        total_frames: environment steps after which iteration stops, rounded up to whole rollouts;
+            -1: unlimited.
         seed: seed of the action noise.
         learner: its ``during_step`` runs during each step, its ``after_step`` after it.
 

@@ -144,7 +144,7 @@ def advantages(
         gae_lambda: lambda.
     """
     discount = after.get("discount", None)
-    # TorchRL declares a number, but also accepts a tensor with a value per step.
+    # TorchRL's type hint asks for a number, but a tensor with a value per step works too.
     gammas: Any = gamma if discount is None else gamma * discount
     # TorchRL multiplies values after a termination by 0, which leaves NaN and infinity as NaN.
     following = next_values.masked_fill(after["terminated"], 0.0)

@@ -70,9 +70,9 @@ class PPOLearner:
 
     Policy and value function are separate networks, coupled only by the norm to which their joint
     gradient is clipped. On a CPU with two or more threads each learns in its own thread. Splitting
-    each matrix product over torch's threads would be no faster on an idle machine, much slower on
-    a busy one, where each product waits for the slowest thread, and the result would depend on the
-    number of threads.
+    each matrix product over torch's threads would make the result depend on the number of threads.
+    On an idle machine it would be no faster. On a busy one it would be much slower, since each
+    product would wait for the slowest thread.
 
     Args:
         model: policy and value function, changed in place.

@@ -67,7 +67,7 @@ class Extras:
     stop: Callable[[], bool] = lambda: False
     """Polled at safe points; True stops the training as ``interrupted``."""
     replay_folder: Path | None = None
-    """Where an off-policy learner stores its replay; None: in memory, which cannot be resumed."""
+    """Where an off-policy learner stores its replay; None: in memory, so the run cannot resume."""
     metadata: dict[str, Any] = field(default_factory=dict)
     """Plain values stored in each checkpoint, such as the versions of libraries."""
 
@@ -78,7 +78,7 @@ _STATE = {
     "elapsed_s": float,
     "best_score": list,
 }
-"""What a checkpoint holds, and its types."""
+"""Keys of a checkpoint's state, with the types of their values."""
 _MISFITS = (
     *(LookupError, ValueError, TypeError, AttributeError, RuntimeError),
     *(AssertionError, ArithmeticError, PgdmError),
@@ -269,7 +269,7 @@ class Trainer:
     def state_dict(self) -> State:
         """Return all that the rest of the training depends on, tensors and plain values only."""
         collector = dict(self._collector.state_dict())
-        del collector["frames"]  # the same as the trainer's between iterations
+        del collector["frames"]  # between iterations it equals the trainer's
         return {
             "network": asdict(self._learner.model.cfg),
             "learner": self._learner.state_dict(),

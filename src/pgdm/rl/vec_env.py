@@ -53,7 +53,7 @@ class VecEnv(Protocol):
             finished rows the last observation before the restart; ``episodes``, the
             `FinishedEpisodes` in the order of their rows, or None; the reward terms {name: (N,)}
             before (``raw_terms``) and after (``terms``) weighting; and optionally ``discount``
-            (N,) in [0, 1], a factor on everything after the step, by default 1.
+            (N,) in [0, 1], a factor on all rewards after the step, by default 1.
         """
         ...
 

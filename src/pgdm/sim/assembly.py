@@ -15,7 +15,8 @@ from pgdm.library.published_masses import RATIOS
 if TYPE_CHECKING:
     from pgdm.sim.scene import HandCfg, PlacementCfg, SimCfg, TaskCfg
 
-# Contact priority by which the randomised geom's friction overrides the other's (released code).
+# Contact priority by which the randomised geom's friction overrides that of whatever it touches
+# (released code).
 RANDOMIZED_PRIORITY = 10
 
 
@@ -24,7 +25,7 @@ class Assembly(NamedTuple):
 
     spec: mujoco.MjSpec
     folders: dict[str, Path]
-    """Prefix of a part's names -> the folder of its meshes and textures: table, hand, objects."""
+    """For table, hand and objects: prefix of the part's names -> folder of its meshes, textures."""
     randomized: str | None
     """Name of the randomised geom."""
 

@@ -20,7 +20,7 @@ Data = mujoco.MjData
 
 Array = np.ndarray | Tensor
 
-_CURRENT = mujoco.mjtStage.mjSTAGE_VEL  # positions and velocities are updated after a step
+_CURRENT = mujoco.mjtStage.mjSTAGE_VEL  # update what follows from positions and velocities
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ class SimBatch:
         """Restore the bit-exact state of rows (N, nstate) copied from ``rows`` earlier.
 
         Raises:
-            SceneError: if the rows have the wrong shape, that of another scene.
+            SceneError: if the rows have the wrong shape: they are of another scene.
         """
         if rows.shape != self.rows.shape:
             raise SceneError(

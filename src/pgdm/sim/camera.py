@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 # MuJoCo's camera azimuths, in order of preference; 90 looks along +y. The hand approaches from -y
-# over the centre of the table; seen from the front right, the fingers do not hide the object. The
-# others are for scenes in which a board or a door blocks that view.
+# over the centre of the table. In the first view, from the hand's front right, its fingers do not
+# hide the object. The other views are for scenes in which a board or a door blocks the first.
 AZIMUTHS_DEG = (-125.0, -55.0, 180.0, 0.0, 125.0, 55.0)
 ELEVATION_DEG = -22.0
 ROOM_M = 0.2
@@ -79,7 +79,7 @@ def _axes(azimuth_deg: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _movers(model: mujoco.MjModel, object_body: int) -> np.ndarray:
-    """Return a mask (ngeom,) of the geoms of hand and object, which move and may block the view."""
+    """Return a mask (ngeom,) of the moving geoms, hand and object: rays may pass through them."""
     joints = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
     hands = np.unique(model.body_rootid[model.jnt_bodyid[joints]])
     of_hand = np.isin(model.body_rootid, hands)

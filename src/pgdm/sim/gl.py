@@ -63,8 +63,9 @@ def deferred() -> Iterator[None]:
 def backends() -> list[str]:
     """Return the OpenGL backends to try, the user's choice first.
 
-    The user chooses with ``MUJOCO_GL`` or PyOpenGL's ``PYOPENGL_PLATFORM``. On Linux the rest of
-    EGL, OSMesa and GLFW follow; elsewhere the only backend is "", which leaves MuJoCo the choice.
+    The user chooses with ``MUJOCO_GL`` or PyOpenGL's ``PYOPENGL_PLATFORM``. On Linux the backends
+    are EGL, OSMesa and GLFW; those not chosen keep this order. Elsewhere the only one is "", which
+    leaves the choice to MuJoCo.
 
     Raises:
         RenderError: if ``MUJOCO_GL`` switches rendering off.

@@ -117,7 +117,7 @@ def _check_joints(model: mujoco.MjModel, hand: HandCfg) -> int:
                 "be a slide or a hinge (six of them in place of a free joint)",
             )
         if own[joint] != (joint < count):
-            raise _wrong(hand, f"joint '{name}' is not the hand's, whose joints must come first")
+            raise _wrong(hand, f"joint '{name}' is not the hand's; the hand's must come first")
         if own[joint] and not model.jnt_limited[joint]:
             raise _wrong(hand, f"joint '{name}' has no range")
         if own[joint] and model.qpos0[joint]:
@@ -141,7 +141,7 @@ def _check_base(model: mujoco.MjModel, hand: HandCfg) -> None:
         if not _fits(model, joint, joint) or body.name != mount or body.parentid[0]:
             raise _wrong(
                 hand,
-                f"joint '{_joint(model, joint)}' is number {joint} of its joints, which must be a "
+                f"its joint number {joint} is '{_joint(model, joint)}'; that joint must be a "
                 f"{wanted} at the origin of the mount body '{mount}', a child of the world",
             )
 

@@ -14,7 +14,7 @@ from pgdm.sim.scene import Scene
 def motion_qpos(scene: Scene, start: np.ndarray, reference: ObjectReference) -> np.ndarray:
     """Return qpos (T, nq) with the object on the exemplar motion, all else as in ``start`` (nq,).
 
-    An object that lacks the six joints of a free object (`pgdm.sim.hand_model.BASE`) stays too.
+    Without the six joints of a free object (`pgdm.sim.hand_model.BASE`) the object stays as well.
     """
     model, body = scene.model, scene.index.object_body
     qpos = np.repeat(start[None], len(reference), axis=0)

@@ -67,9 +67,9 @@ class TaskCfg:
     tcdm30: bool
     """Whether the task is one of the 30 on which the paper compares methods."""
     pregrasp_source: str
-    """Origin of the pre-grasp: mocap, teleop, labeled or learned; search: pgdm's own."""
+    """Origin of the mined pre-grasp, such as mocap, labeled or search."""
     trajectory_source: str
-    """Origin of the exemplar motion: mocap, expert or animator; keyframes: pgdm's own."""
+    """Origin of the exemplar motion, such as mocap, animator or keyframes."""
     paper_success: float | None
     """Success of the paper's PGDM after 50M frames, mean of 3 seeds (0..1)."""
     paper_com_error: float | None

@@ -174,7 +174,7 @@ class WarpBatch:
         """Restore all simulations from an earlier copy of ``rows``.
 
         Raises:
-            SceneError: if the rows have the wrong shape, that of another scene or engine.
+            SceneError: if the rows have the wrong shape: they are of another scene or engine.
         """
         rows, shape = torch.as_tensor(rows, device=self.device), self.rows.shape
         if rows.shape != shape:
