@@ -91,8 +91,8 @@ def check_order(quat: np.ndarray, rest: Rotation, label: str, cure: str) -> None
         cure: advice in the message on how to state the order.
 
     Raises:
-        ConfigError: read as wxyz it is tilted or rotated far from the resting orientation, read as
-            xyzw it is near in the same measure.
+        ConfigError: read as wxyz, the orientation is tilted or rotated far from the resting one;
+            read as xyzw, it is close by the same measure.
     """
     taken, other = (Rotation.from_quat(quat, scalar_first=f) * rest.inv() for f in (True, False))
     tilts = [float(np.arccos(np.clip(r.as_matrix()[2, 2], -1, 1))) for r in (taken, other)]
