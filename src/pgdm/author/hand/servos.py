@@ -15,7 +15,7 @@ KP = 3.0
 _DAMPING_S = 0.05  # damping of a joint that has none, as a share of its servo's gain
 _SINGLE = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 _OUT_RAD = 1e-3  # by how much a coupled joint may leave its range
-_SAMPLES = 2001  # positions tried of a leader, a joint that others follow
+_SAMPLES = 2001  # positions tried in the range of a leader (joint that others follow)
 
 
 @dataclass(frozen=True)

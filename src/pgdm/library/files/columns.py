@@ -62,7 +62,8 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
         if meanings.count(wanted) != 1:
             raise CorruptAssetError(
                 f"{label}: has {meanings.count(wanted)} columns '{wanted}' among "
-                f"{', '.join(names)}; a pose takes {', '.join(POSE)} (m), and optionally time (s)"
+                f"{', '.join(names)}; a pose takes {', '.join(POSE)} (lengths in m), "
+                "and optionally time (s)"
             )
     times = rows[:, meanings.index("time")] if "time" in meanings else None
     others = [name for name, meaning in zip(names, meanings, strict=True) if not meaning]

@@ -111,7 +111,8 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
         return PoseFile(pos, quat, repairs)
     wanted = STEP_S * np.arange(int(elapsed[-1] / STEP_S + 1e-9) + 1)
     repairs.append(
-        f"resampled {len(rows)} rows over {elapsed[-1]:.2f} s to {len(wanted)}, {STEP_S:g} s apart"
+        f"resampled {len(rows)} rows over {elapsed[-1]:.2f} s to {len(wanted)} rows "
+        f"{STEP_S:g} s apart"
     )
     orientations = Slerp(elapsed, Rotation.from_quat(quat, scalar_first=True))(wanted)
     quat = continuous(orientations.as_quat(scalar_first=True))
