@@ -190,7 +190,7 @@ def test_a_missing_or_other_model_is_refused(tmp_path: Path) -> None:
     _recordings(tmp_path)
     scene = tmp_path / myohand._SCENE
     scene.write_text(scene.read_text().replace('<joint type="hinge" axis="1 0 0"/>', ""))
-    with pytest.raises(CorruptAssetError, match="has 28 joints, 29 expected"):
+    with pytest.raises(CorruptAssetError, match="has 28 joints; it must have 29"):
         MyoHand(tmp_path)
 
 

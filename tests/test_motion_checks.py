@@ -133,7 +133,7 @@ def test_poses_come_from_csv_json_and_npz() -> None:
     for name in ("b.csv", "d.json", "e.npz"):  # recorded at 50 Hz: every second row
         found = pose_file.read(Path(name))
         assert found.pos == pytest.approx(rows[::2, :3], abs=1e-9)
-        resampled = ["resampled 30 rows over 0.58 s to 15, 0.04 s apart"]
+        resampled = ["resampled 30 rows over 0.58 s to 15 rows 0.04 s apart"]
         assert found.repairs == (resampled if found.named else assumed + resampled)
         assert found.named == (name == "b.csv")
 

@@ -32,7 +32,7 @@ _TOUCH_M = 1e-4
 _SLIDES = 3  # the first joints of the base
 _HAND_M = 0.3  # if the object turns, the base may travel this much less than the object
 _CURE = "shorten the motion, or put the object elsewhere (place in the keyframes)"
-_COMPARED = 5  # poses that are lift-tested
+_COMPARED = 5  # how many of the nearest poses are lift-tested
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def make_pregrasp(
     if excess.max() > 0.0:
         row, joint = np.unravel_index(int(excess.argmax()), excess.shape)
         raise ConfigError(
-            f"the hand cannot follow the motion: moving rigidly with the object, joint "
+            f"the hand cannot follow the motion: if it moved rigidly with the object, joint "
             f"{scene.model.joint(int(joint)).name} would leave its range by "
             f"{excess[row, joint]:.2f} {'m' if joint < _SLIDES else 'rad'} more than a policy can "
             f"compensate for, most at step {row}; {_CURE}"
@@ -99,7 +99,7 @@ def make_pregrasp(
 
 
 def _check_travel(scene: Scene, poses: Poses) -> None:
-    """Check that the base's slides are long enough for the motion, before a pose is searched.
+    """Check that the base's slides are long enough for the motion, before the pre-grasp is sought.
 
     Raises:
         ConfigError: they are too short, whatever the pre-grasp.
@@ -117,7 +117,7 @@ def _check_travel(scene: Scene, poses: Poses) -> None:
 
 
 def _firmest(scene: Scene, poses: list[NearPose], progress: StepProgress) -> FoundPregrasp:
-    """Return, of the nearest poses, the one from which most random closings lift the object.
+    """Return, of the nearest poses, the one whose random closings lift the object most often.
 
     If the object cannot be lifted, return the nearest pose.
     """
@@ -134,7 +134,10 @@ def _firmest(scene: Scene, poses: list[NearPose], progress: StepProgress) -> Fou
 
 
 def _base_over(scene: Scene, poses: Poses) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of qpos (nq,): excess (T, B) of base joints over range + slack, m, rad."""
+    """Return a function of qpos (nq,) that returns the excess of base joints (T, B) m or rad.
+
+    The excess is how far a joint is beyond its range plus slack, negative inside.
+    """
     reference = ObjectReference(torch.from_numpy(poses.pos), torch.from_numpy(poses.quat))
     low, high = scene.model.jnt_range[: scene.index.num_base_joints].T
     slack = np.array([SLACK_M] * _SLIDES + [SLACK_RAD] * (len(low) - _SLIDES))

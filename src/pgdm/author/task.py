@@ -132,7 +132,7 @@ def task_scene(request: TaskRequest, library: Library) -> Scene:
 
 
 def remove_task(task: str) -> Path | None:
-    """Remove a task of the user's: its motion and its file.
+    """Remove a task of the user's: its motion and its settings file.
 
     Returns:
         The folder to which its pre-grasps were moved, or None if it had none.

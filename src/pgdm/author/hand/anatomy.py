@@ -24,7 +24,7 @@ _WORDS = {
     "thumb": ("thumb", "th"),
 }
 """Words in the names of links and joints; words of two letters count only at a name's start."""
-_MOST_WRIST = 3  # most joints that may move the palm; with more, the hand is on an arm
+_MOST_WRIST = 3  # limit of joints that move the palm; with more, the hand is on an arm
 _SAME_M = 0.005  # joints closer together than this form one knuckle
 _PAD_M = 0.012  # from the end of a finger to the middle of its pad
 _ALONG = 0.8  # from this cosine on, a joint's axis counts as running along the link
@@ -193,7 +193,7 @@ def _chosen(
 
 
 def _by_words(names: set[str]) -> str | None:
-    """Return the human finger that the most names of a finger point to; None if none or a tie."""
+    """Return the human finger to which most names of a finger point; None if none or a tie."""
     counts = {
         human: sum(any(_says(name.lower(), word) for word in words) for name in names)
         for human, words in _WORDS.items()

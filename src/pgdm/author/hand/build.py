@@ -32,7 +32,7 @@ _BASE = (
     *(("base_ry", (0, 1, 0), (-1.75, 1.75)), ("base_rz", (0, 0, 1), (-2.5, 2.5))),
 )
 """Name, axis and range [m, rad] of the base joints."""
-_BASE_KP, _BASE_DAMPING, _ARMATURE = (175.0, 150.0), 20.0, 0.001  # Adroit's: slides, hinges
+_BASE_KP, _BASE_DAMPING, _ARMATURE = (175.0, 150.0), 20.0, 0.001  # Adroit's; KP: slides, hinges
 
 _STIFF_S2 = 2e-4  # least armature per servo gain that is stable with substeps of 4 ms
 _SURFACE = {"friction": [1.0, 0.5, 0.01], "condim": 4, "margin": 0.0005}  # the benchmark's
@@ -61,12 +61,12 @@ class Plan:
     servos: dict[str, Servo]
     """By joint; coupled joints have none."""
     ranges: dict[str, tuple[float, float]]
-    """Ranges of joints that were narrowed."""
+    """Narrowed ranges, by joint."""
     plain_surface: bool
-    """Whether colliding geoms get the benchmark's friction, contact dimension and margin: URDF has
-    none."""
+    """Whether colliding geoms get the benchmark's friction, contact dimension and margin: URDF
+    cannot state them."""
     reset: dict[str, float]
-    """Reset positions, rad or m, of the joints where it is not zero."""
+    """Reset positions, rad or m, of the joints that are not reset to zero."""
     excluded: list[tuple[str, str]]
     """Pairs of bodies that do not collide: they overlap in the reset pose."""
 
@@ -92,7 +92,7 @@ def light(xml: str) -> str:
     """
     spec = named(xml)
     model = spec.compile()
-    for body in spec.bodies[1:]:  # without the world; geoms that are deleted below may give mass
+    for body in spec.bodies[1:]:  # all but the world; their mass may come from geoms deleted below
         whole = model.body(body.name)
         if whole.mass[0] > 0:
             body.explicitinertial, body.fullinertia = True, [math.nan] * 6

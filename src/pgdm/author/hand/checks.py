@@ -27,12 +27,12 @@ class Checks:
     joints: int
     """Number of joints, without the base."""
     coupled: int
-    """Number of these that follow another joint."""
+    """Number of those joints that follow another joint."""
     mass_kg: float
     excluded: list[tuple[str, str]]
     """Pairs of links that overlap in the reset pose; they do not collide."""
     self_collisions: list[tuple[str, str]]
-    """Further pairs that overlap in the mean hand."""
+    """Further pairs that overlap in the mean hand, whose fingers are as in a mean pre-grasp."""
     height_m: float
     """Height of the hand's lowest point above the table in the reset pose."""
     reset_error_rad: float
@@ -83,7 +83,7 @@ def check(scene: Scene, excluded: list[tuple[str, str]], mean: np.ndarray) -> Ch
     Args:
         scene: as from :func:`pgdm.sim.scene.bare_scene`.
         excluded: pairs of links that were excluded from collision.
-        mean: the mean hand (n,), m and rad, base at zero.
+        mean: joint positions (n,) of the mean hand, m and rad, base at zero.
 
     Raises:
         SceneError: a link has no mass or inertia, the hand is implausibly heavy or light, is inside

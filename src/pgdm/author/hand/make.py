@@ -35,8 +35,9 @@ from pgdm.sim.scene import HandCfg, Scene, bare_scene
 R = TypeVar("R")
 
 MEAN_SHARE = 0.37
-"""Where the mean hand has its closing joints, as a share of the way from straight to closed: the
-mean over the three hands of the benchmark, 0.38, 0.35 and 0.39."""
+"""In the *mean hand*, the fingers are as in a mean pre-grasp: each joint that closes a finger is at
+this share of the way from straight to closed. The value is the mean over the benchmark's three
+hands, which have 0.38, 0.35 and 0.39."""
 
 _KP = (0.01, 1000.0)
 _PLACE_M = ((-1.0, 1.0), (-1.5, 0.5), (0.0, 1.5))
@@ -87,7 +88,7 @@ class AuthoredHand:
     """``right`` or ``left``."""
     servos: dict[str, actuators.Servo]
     mean: np.ndarray
-    """Mean hand, (n,) m and rad, base at zero."""
+    """Joint positions (n,), m and rad, of the mean hand (see :data:`MEAN_SHARE`), base at zero."""
     checks: Checks
     notes: list[str]
     """What was changed or left out."""
@@ -121,7 +122,7 @@ def author_hand(request: HandRequest, progress: StepProgress = silent) -> Author
         model.jnt_range[model.joint(name).id] = span
     found = parts.find(model, request.fingers, label)
     reset = models.reset_of(model, request.reset, label)
-    progress("finding the palm", 1, 4)
+    progress("orienting the hand", 1, 4)
     plan = models.Plan(
         *(request.name, np.eye(3), np.zeros(3), servos, ranges),
         *(source.kind == "URDF", reset, []),
@@ -214,7 +215,7 @@ def _quietly(function: Callable[..., R], *arguments: Any) -> R:
 
 
 def _palm_normal(xml: str, found: Anatomy, plan: models.Plan, cfg: HandCfg) -> np.ndarray:
-    """Return the direction (3,) the palm faces, in which fingers bend, in the file's frame."""
+    """Return the direction (3,) in which the palm faces and fingers bend, in the file's frame."""
     scene = _scene(xml, found, plan, cfg)  # with the file's axes as the world's
     flexion = Flexion(scene)
     qpos = np.zeros(scene.model.nq)
@@ -246,7 +247,7 @@ def _mounted(
 
 
 def _other_side(label: str, xml: str, side: str) -> str | None:
-    """Return a note if the names of file and model contain only the other side; None if not."""
+    """Return a note if the names of file and model state only the other side, otherwise None."""
     model = ET.fromstring(xml).get("model", "")
     other = "left" if side == "right" else "right"
     words = f"{label} {model}".lower()

@@ -1,4 +1,4 @@
-"""Position servos of a hand's joints, and joint ranges that keep coupled joints in theirs."""
+"""Position servos of a hand's joints, and joint ranges that keep coupled joints within limits."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KP = 3.0
 _DAMPING_S = 0.05  # damping of a joint that has none, as a share of its servo's gain
 _SINGLE = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 _OUT_RAD = 1e-3  # by how much a coupled joint may leave its range
-_SAMPLES = 2001  # of a leader's range
+_SAMPLES = 2001  # positions tried in the range of a leader (joint that others follow)
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ def servos(
     """Return the servo of each joint that follows no other, and what was changed.
 
     Only the first actuator of a joint counts. If it is a position actuator with gear 1, the servo
-    has its range, as far as the joint's allows, and its gain unless ``kp`` is given. Any other
-    joint gets a servo over the joint's range, of gain ``kp`` or :data:`KP`.
+    takes over the actuator's range, clipped to the joint's, and unless ``kp`` is given, its gain.
+    Any other joint gets a servo over the joint's range, of gain ``kp`` or :data:`KP`.
 
     Args:
         model: the hand as read.
@@ -51,7 +51,7 @@ def servos(
     Raises:
         ConfigError: an actuator drives a tendon, without ``drop_tendons``; a joint is neither hinge
             nor slide, has no range, or has a ``ref``; an equality constraint does not couple two
-            joints; or a joint follows one that follows another.
+            joints; or a joint follows a joint that itself follows another.
     """
     couplings = Couplings(model, model.njnt)
     _check_equalities(model, couplings, label)
@@ -114,8 +114,8 @@ def _servo(
         else:
             name = model.joint(joint).name
             notes.append(
-                f"the actuator of '{name}' is not a position servo with gear 1; such a one "
-                "replaces it"
+                f"the actuator of '{name}' is not a position servo with gear 1 and was "
+                "replaced by one"
             )
     given = gain is not None and kp is None
     gain = gain if given and gain is not None else (KP if kp is None else kp)
@@ -170,6 +170,6 @@ def narrowed(model: mujoco.MjModel) -> tuple[dict[str, tuple[float, float]], lis
         found[name] = float(swept[first]), float(swept[last])
         notes.append(
             f"joint '{name}' goes from {found[name][0]:.2f} to {found[name][1]:.2f} instead of "
-            f"{low:.2f} to {high:.2f}: beyond that a joint that follows it leaves its range"
+            f"{low:.2f} to {high:.2f}: otherwise, a joint that follows it would leave its own range"
         )
     return found, notes

@@ -62,7 +62,8 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
         if meanings.count(wanted) != 1:
             raise CorruptAssetError(
                 f"{label}: has {meanings.count(wanted)} columns '{wanted}' among "
-                f"{', '.join(names)}; a pose takes {', '.join(POSE)} (m), and optionally time (s)"
+                f"{', '.join(names)}; a pose takes {', '.join(POSE)} (lengths in m), "
+                "and optionally time (s)"
             )
     times = rows[:, meanings.index("time")] if "time" in meanings else None
     others = [name for name, meaning in zip(names, meanings, strict=True) if not meaning]
@@ -91,8 +92,8 @@ def check_order(quat: np.ndarray, rest: Rotation, label: str, cure: str) -> None
         cure: advice in the message on how to state the order.
 
     Raises:
-        ConfigError: read as wxyz it is tilted or rotated far from the resting orientation, read as
-            xyzw it is near in the same measure.
+        ConfigError: read as wxyz, the orientation is tilted or rotated far from the resting one;
+            read as xyzw, it is close by the same measure.
     """
     taken, other = (Rotation.from_quat(quat, scalar_first=f) * rest.inv() for f in (True, False))
     tilts = [float(np.arccos(np.clip(r.as_matrix()[2, 2], -1, 1))) for r in (taken, other)]

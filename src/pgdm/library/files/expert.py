@@ -40,9 +40,10 @@ class Expert:
     qpos: np.ndarray = field(repr=False)
     """Adroit's joint positions (T, 30), not clipped: they may exceed the joints' limits."""
     human_joints: np.ndarray = field(repr=False)
-    """Joint locations of the human hand (T, 16, 3), MANO order; the last of a finger is its DIP."""
+    """Joint locations of the human hand (T, 16, 3), MANO order; the last joint of each finger
+    is the one nearest to its tip."""
     fingertips: np.ndarray = field(repr=False)
-    """Adroit's fingertips (T, 5, 3) at the joint positions clipped to their limits."""
+    """Adroit's fingertips (T, 5, 3) when ``qpos`` is clipped to the joints' limits."""
     contacts: np.ndarray = field(repr=False)
     """Points of the object closest to the human fingers (T, 5, 3), in the frame of the object's
     body (whose origin is not the centre of mass)."""

@@ -33,9 +33,9 @@ class ExpertEntry:
     """Offset (3,) m, world frame, added to the recorded positions so that the object is where the
     motion has it."""
     object_mean_m: float
-    """Distance of the recording's object from the motion's after ``shift_m``, mean over poses."""
+    """Distance between the motion and the recorded object after ``shift_m``, mean over poses."""
     object_max_m: float
-    """Largest distance of the recording's object from the motion's after ``shift_m``."""
+    """Largest distance between the motion and the recorded object after ``shift_m``."""
     beyond_limits_m: float
     """Largest excess of the base's slides over their limits."""
     beyond_limits_rad: float

@@ -1,7 +1,7 @@
 """Smooth object motions from keyframes.
 
 Positions are quintic splines of time, as are the rotation vectors relative to the orientation at
-the last rest. The velocity at a keyframe is the slope of a monotone cubic interpolant, zero at
+the preceding rest. The velocity at a keyframe is the slope of a monotone cubic interpolant, zero at
 rests; the acceleration at keyframes is zero. Thus the motion is twice continuously differentiable,
 starts and ends at rest, and passes through every keyframe. If the object rests at two consecutive
 keyframes, it moves between them along a line and by slerp, with the minimum-jerk profile
@@ -77,7 +77,7 @@ class Animation:
         return sample(self.keyframes, times)
 
     def at(self, pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the trajectory for a resting pose, shaped as by :meth:`trajectory`, world frame.
+        """Return the trajectory in the world frame, in the shapes of :meth:`trajectory`.
 
         Args:
             pos: centre of mass (3,) m of the resting object.

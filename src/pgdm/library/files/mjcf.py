@@ -1,4 +1,4 @@
-"""Writing MJCF: elements, and the defaults shared by TCDM's models (the authors' repository)."""
+"""Writing MJCF: elements, and defaults shared by the models of TCDM (the authors' repository)."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def model(name: str) -> ET.Element:
 
 
 def add(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:
-    """Append an element and return it; write the attribute ``class`` as ``class_``."""
+    """Append an element and return it; pass the attribute ``class`` as ``class_``."""
     element = ET.SubElement(parent, tag)
     element.attrib.update({key.rstrip("_"): value for key, value in attributes.items()})
     return element

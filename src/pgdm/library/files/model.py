@@ -24,24 +24,24 @@ _NUMERIC = frozenset(_NUMERIC_NAMES.split())
 _DROPPED_NAMES = "njmax nconmax nstack apirate collision mpr_iterations mpr_tolerance"
 _DROPPED = frozenset(_DROPPED_NAMES.split())
 """Attributes of ``size`` and ``option`` that MuJoCo no longer accepts. Dropping them changes no
-trajectory: the first three only limited memory."""
+trajectory: ``njmax``, ``nconmax`` and ``nstack`` only limited memory."""
 
 
 def parse(path: Path, defects: list[str], root: Path, includes: Path | None = None) -> ET.Element:
     """Parse an MJCF file and insert its includes.
 
     File attributes become absolute paths. Numbers followed by stray characters are read as older
-    versions of MuJoCo did, and reported.
+    versions of MuJoCo read them; each such repair is reported in ``defects``.
 
     Args:
         path: the file.
         defects: messages about repairs are appended.
-        root: folder that no file of the model may leave; names in messages are relative to it.
+        root: folder that must contain all files of the model; messages name files relative to it.
         includes: folder of the included files, by default that of the including file.
 
     Raises:
-        CorruptAssetError: a file is missing, damaged, includes itself, or refers to a file outside
-            of ``root``.
+        CorruptAssetError: a file is missing or damaged, includes itself, or refers to a file
+            outside of ``root``.
     """
     return _parse(Path(os.path.abspath(path)), defects, Path(os.path.abspath(root)), includes, ())
 

@@ -40,9 +40,9 @@ class Motion:
     source: str
     """Library source from which it was read, such as ``checkout``."""
     translation: np.ndarray = field(repr=False)
-    """Target of the centre of mass (T, 3) m, world frame. In the benchmark's recorded motions it is
-    the position of the mesh's origin, which the released code uses as that target, see
-    `ReferenceCfg.frame`."""
+    """Target of the centre of mass (T, 3) m, world frame. In the benchmark's recorded motions
+    it holds positions of the mesh's origin, which the released code nevertheless uses as the target
+    of the centre of mass; see `ReferenceCfg.frame`."""
     orientation: np.ndarray = field(repr=False)
     """Target of the object body's orientation (T, 4), unit quaternion wxyz."""
     substeps: int

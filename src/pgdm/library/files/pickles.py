@@ -1,9 +1,9 @@
 """Reading pickles without running code from them.
 
 TCDM stores its start states in a pickled object array; ``numpy.load(allow_pickle=True)`` would run
-any code that such a file names. Here a pickle is first read as a list of opcodes, of which only
-those that build plain values are allowed, and then loaded with stand-ins for the few NumPy
-functions that arrays need, so that not even NumPy's ``__setstate__`` sees the file's bytes.
+any code that such a file names. Here a pickle is first read as a list of opcodes; only those that
+build plain values are allowed. Then it is loaded with stand-ins for the few NumPy functions that
+arrays need, so that not even NumPy's ``__setstate__`` sees the file's bytes.
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ def _refused(label: str, what: str) -> UnsafePickleError:
 def _scan(data: bytes, label: str, objects: Sequence[str]) -> None:
     """Refuse opcodes and names that plain values do not need, before loading anything.
 
-    Names that STACK_GLOBAL takes from the stack are refused later, by ``find_class``.
+    Names that STACK_GLOBAL takes from the stack are checked later, by ``find_class``.
     """
     for opcode, arg, _ in pickletools.genops(data):
         if opcode.name not in _OPCODES and not (objects and opcode.name in _OBJECT_OPCODES):

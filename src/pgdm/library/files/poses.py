@@ -23,7 +23,8 @@ from pgdm.library.tasks import STEP_S
 SUFFIXES = (".csv", ".npz", ".json")
 """Supported formats."""
 
-# Largest deviation of a quaternion's norm from 1 that is ignored, and that is normalised.
+# Deviation of a quaternion's norm from 1: up to the first limit it is ignored, up to the second the
+# quaternion is normalised, beyond that it is an error.
 _UNIT_TOLERANCE, _UNIT_LIMIT = 1e-6, 0.05
 _ROWS = (2, 1_000_000)
 _PARTS = ("poses", "object", "time", "columns")
@@ -44,13 +45,13 @@ class PoseFile:
 
 
 def read(path: Path) -> PoseFile:
-    """Read poses: rows with named columns, or else of x y z qw qx qy qz, optionally after a time.
+    """Read poses: rows with named columns, or with x y z qw qx qy qz after an optional time.
 
-    A header line names the columns of a ``.csv``. A ``.json`` is a list of rows or of objects with
-    named values, or has ``poses`` and optionally ``time`` and ``columns``. An ``.npz`` has
-    rows in ``poses`` or ``object`` and optionally ``time`` (T,) and ``columns``. Or it has, as the
-    library's motions, ``object_translation`` and ``object_orientation`` (wxyz); its ``time`` is
-    then ignored. Rows without times are 0.04 s apart.
+    A header line names the columns of a ``.csv``. A ``.json`` is a list of rows, each a list or a
+    JSON object with named values; or it has ``poses`` and optionally ``time`` and ``columns``. An
+    ``.npz`` has rows in ``poses`` or ``object`` and optionally ``time`` (T,) and ``columns``. Or,
+    like the library's motions, the ``.npz`` has ``object_translation`` and ``object_orientation``
+    (wxyz); its ``time`` is then ignored. Rows without times are 0.04 s apart.
 
     Raises:
         ConfigError: the format is not supported, or there is no such file.
@@ -80,8 +81,9 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
 
     Raises:
         CorruptAssetError: there are fewer than two or over a million rows, a value is NaN or
-            infinite, a norm deviates from 1 by more than 0.05, or times do not increase or span
-            less than 0.04 s or more than an hour; the message names the row if there is one.
+            infinite, a quaternion's norm deviates from 1 by more than 0.05, times do not increase,
+            or the motion lasts less than 0.04 s or more than an hour; if one row is to blame, the
+            message names it.
     """
     repairs: list[str] = []
     if rows.ndim != 2 or rows.shape[1] != 7 or not _ROWS[0] <= len(rows) <= _ROWS[1]:
@@ -109,7 +111,8 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
         return PoseFile(pos, quat, repairs)
     wanted = STEP_S * np.arange(int(elapsed[-1] / STEP_S + 1e-9) + 1)
     repairs.append(
-        f"resampled {len(rows)} rows over {elapsed[-1]:.2f} s to {len(wanted)}, {STEP_S:g} s apart"
+        f"resampled {len(rows)} rows over {elapsed[-1]:.2f} s to {len(wanted)} rows "
+        f"{STEP_S:g} s apart"
     )
     orientations = Slerp(elapsed, Rotation.from_quat(quat, scalar_first=True))(wanted)
     quat = continuous(orientations.as_quat(scalar_first=True))

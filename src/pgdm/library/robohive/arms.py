@@ -32,7 +32,7 @@ _LOOKS = {"panda_viz": "0.92 0.92 0.95 1", "panda_grey_viz": "0.4 0.4 0.4 1"}
 def panda(sims: Path, defects: list[str]) -> ET.Element:
     """Return the arm without gripper: joints ``joint1`` to ``joint7`` and the site ``flange``.
 
-    The package shifts joints 6 and 7 by a quarter and an eighth of a turn and rounds their frames;
+    The package shifts joint 6 by a quarter turn and joint 7 by an eighth, and rounds their frames;
     here all joints have the manufacturer's zeros and limits. There are no actuators. Collision
     geoms touch the objects and the table, but not the hand.
 
@@ -80,7 +80,7 @@ def _rebuild(link: ET.Element, number: int) -> None:
     link.set("name", f"link{number}")
     for item in link.findall("camera") + link.findall("site"):
         link.remove(item)
-    if number >= 6:  # in the package their frames include the joint shifts
+    if number >= 6:  # in the package, frames 6 and 7 include the joint shifts
         link.attrib.pop("euler", None)
         link.set("quat", _EXACT)
     elif "quat" in link.attrib:

@@ -22,13 +22,13 @@ STORED_POSES = {"alarmclock-lift": 40, "duck-lift": 38, "waterbottle-lift": 42}
 first part. Their recordings end at the last stored pose."""
 
 SHIFTED = frozenset({"alarmclock-lift"})
-"""Tasks whose recorded positions have a constant offset, (0.8, -10.1, -2.9) mm from the motion's;
-`Recording.shift` corrects it."""
+"""Tasks whose recorded positions have a constant offset from the motion's, which `Recording.shift`
+corrects; here (0.8, -10.1, -2.9) mm."""
 
 _NEAR_M, _NEAR_COS = 0.003, float(np.cos(0.01))
-"""Largest mean distance of a recording's object from the motion's, and largest rotation between
-them (0.02 rad, as the cosine of half of it); the released recordings stay below 1.5 mm and 0.0034
-rad."""
+"""How far a recording's object may be from the motion: largest mean distance, and largest rotation,
+0.02 rad, given as the cosine of half that angle. The released recordings stay below 1.5 mm and
+0.0034 rad."""
 
 
 @dataclass(frozen=True)

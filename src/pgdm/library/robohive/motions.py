@@ -27,7 +27,7 @@ NOTES = {
 """Remaining differences from TCDM's data by task, apart from the missing reach plan."""
 
 SKIPPED_FRAMES = {"mug-drink3": 6}
-"""Number of frames at the beginning of a motion, by task, that TCDM's motion lacks."""
+"""By task, number of first frames of the package's motion that TCDM's motion lacks."""
 
 _EXPERT = {"wineglass-toast1": ("Adroit_wineglass_toast_1.npz", 15)}
 """Tasks whose motion is taken from an expert trajectory: file and first frame."""

@@ -1,4 +1,4 @@
-"""A package with a second recording of each motion, with MyoHand, a simulated human hand.
+"""A package with a second recording of each motion, made for MyoHand, a simulated human hand.
 
 The recordings were made from the same motion-capture frames as the published expert trajectories,
 by the same kind of tracking, and include the four tasks whose published trajectory is empty.
@@ -151,7 +151,7 @@ def _compiled(folder: Path) -> mujoco.MjModel:
     sites = {model.site(i).name for i in range(model.nsite)}
     if model.nq != JOINTS or not names >= set(_POINTS) or not sites >= set(_TIPS):
         raise CorruptAssetError(
-            f"MyoHand's model has {model.nq} joints, {JOINTS} expected, or lacks a tracked point"
+            f"MyoHand's model has {model.nq} joints; it must have {JOINTS}, and every tracked point"
         )
     return model
 

@@ -61,7 +61,7 @@ def fetch(package: Package, folder: Path, offline: bool, progress: StepProgress)
         package: the file to download.
         folder: where downloads are kept.
         offline: never use the network.
-        progress: receives the number of bytes.
+        progress: receives the number of bytes so far.
 
     Raises:
         LibraryError: the wheel is missing and ``offline`` is True, pip is missing or finds no index
@@ -141,11 +141,11 @@ def receive(package: Package, address: str, part: Path, progress: StepProgress) 
         package: the expected file.
         address: URL from :func:`locate`.
         part: file to write, or to resume if an earlier call left it.
-        progress: receives the number of bytes.
+        progress: receives the number of bytes so far.
 
     Raises:
-        LibraryError: every attempt was interrupted, pip cannot download a file that only it may,
-            or the download is not the expected file.
+        LibraryError: every attempt was interrupted, the index requires pip's credentials but pip
+            cannot download the file either, or the download is not the expected file.
     """
     continued = part.exists()
     _stream_all(package, address, part, progress)

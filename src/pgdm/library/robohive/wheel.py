@@ -24,7 +24,7 @@ def unpack(
         archive: the wheel.
         folder: target; files keep their paths below it.
         wanted: returns whether to unpack a path of the archive.
-        progress: receives the number of files.
+        progress: receives the number of files unpacked so far.
 
     Returns:
         The unpacked paths.
