@@ -1,4 +1,4 @@
-"""Searches for hand poses near an object without contact: pre-grasps for a task that has none.
+"""Searches for a pre-grasp if a task has none: hand poses near the object that do not touch it.
 
 A cross-entropy search over the hand's joints, started from several orientations of the base. It
 minimises, over poses h within the joints' limits,
@@ -67,8 +67,8 @@ class NearPose:
 
 
 Beyond = Callable[[np.ndarray], float]
-"""Maps qpos (nq,) to the largest amount by which the base would leave its permitted range along the
-motion, m or rad."""
+"""Maps qpos (nq,) to the largest amount by which the base would leave its permitted range if it
+followed the motion, m or rad."""
 
 
 def poses_near(
