@@ -69,7 +69,7 @@ class Flexion:
         return self._data
 
     def _gains(self, joint: int, tip: int, centre: np.ndarray) -> list[float]:
-        """Return how much nearer (m) to ``centre`` a joint brings a tip on its way to each limit."""
+        """Return how much nearer (m) to ``centre`` a joint brings a tip if turned to each limit."""
         gains = []
         for end in self._model.jnt_range[joint]:
             joints, far = self._straight.copy(), []
