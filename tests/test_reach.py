@@ -330,7 +330,7 @@ def test_plans_of_other_hands_and_scenes(task: str) -> None:
 
 def test_a_search_that_cannot_work_is_refused() -> None:
     REACH.check()
-    with pytest.raises(ConfigError, match="8 steps has no time to move while the last 8 hold"):
+    with pytest.raises(ConfigError, match="8 steps has no time to move: during the last 8"):
         replace(REACH, steps=8).check()
     with pytest.raises(ConfigError, match="4 elites of 4 candidates"):
         replace(REACH, cem=CemCfg(4, 4, 0.3)).check()

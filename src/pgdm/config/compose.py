@@ -42,8 +42,8 @@ class Composer:
     """Composes many experiments; reads each file, and composes each choice of options, only once.
 
     Args:
-        config_dir: a folder of the user's own settings, searched after pgdm's and before the
-            permanent one.
+        config_dir: a folder of the user's own settings, searched after pgdm's and before the user's
+            permanent folder.
         overrides: as typed; only ``hydra.searchpath`` is read here.
 
     Raises:
@@ -73,7 +73,7 @@ class Composer:
         Args:
             overrides: all overrides.
             multirun: whether overrides may have several values.
-            typed: the overrides among them that the user has typed; None: all.
+            typed: the part of ``overrides`` that the user has typed; None: all.
         """
         with self.explaining(overrides):
             found = self._loader.whole(overrides, multirun)

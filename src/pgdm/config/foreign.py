@@ -24,7 +24,7 @@ _REFUSED = {
 }
 """Keys that Hydra or pgdm would obey but that are refused, and the reason given to the user."""
 _TYPED = ("hydra.searchpath", "sweep.most_jobs")
-"""Those of them that a user may type on the command line."""
+"""Keys of ``_REFUSED`` that a user may nevertheless type on the command line."""
 _HANDLING = {"handlers", "formatters", "filters", "loggers"}
 _SHELL = ("setup", "additional_parameters")
 """Keys of a launcher whose values are passed to a shell or a command line."""
@@ -69,7 +69,8 @@ def check_file(file: Path) -> None:
     """Check a file of settings that does not come with pgdm, before Hydra reads it.
 
     Raises:
-        ConfigError: if it cannot be read, or has a key that is refused; names file and key.
+        ConfigError: if it cannot be read, or has a key that is refused; the message names the file
+            and the key.
     """
     try:
         settings = files.read_yaml(file)
@@ -86,7 +87,8 @@ def check_composed(hydra: Mapping[str, Any], typed: Sequence[str]) -> None:
         typed: overrides that the user has typed.
 
     Raises:
-        ConfigError: if they have callbacks, log handlers, or shell commands that nobody typed.
+        ConfigError: if they have callbacks or log handlers, or if they have shell commands that the
+            user has not typed.
     """
     if hydra.get("callbacks"):
         raise ConfigError("hydra.callbacks is refused (it names code to run); leave it out")

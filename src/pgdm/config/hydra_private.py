@@ -161,7 +161,7 @@ class Loader:
                 repo=self._files,
                 config_name=_CONFIG,
                 overrides_list=list(choices),
-                prepend_hydra=True,  # config.yaml overrides some of its options
+                prepend_hydra=True,  # config.yaml overrides some of Hydra's options
                 skip_missing=False,
             )
             own = [d for d in found.defaults if not (d.config_path or "").startswith("hydra/")]
@@ -181,7 +181,7 @@ class Loader:
 
 @contextmanager
 def _composing() -> Iterator[None]:
-    """Lock Hydra's global state, and skip maps that nothing reads, its slowest step."""
+    """Lock Hydra's global state, and skip its slowest step: building maps that nothing reads."""
     with _LOCK:
         version.setbase(_VERSION_BASE)
         before = _defaults._create_interpolation_map
@@ -193,7 +193,7 @@ def _composing() -> Iterator[None]:
 
 
 def _only_if_read(build: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap the builder of Hydra's map of references in a defaults list to skip unused maps."""
+    """Make Hydra's function that maps the references in a defaults list skip unused maps."""
 
     def build_if_read(overrides: Any, defaults_list: list[Any], self_added: bool) -> Any:
         read = any(not entry.is_self() and entry.is_interpolation() for entry in defaults_list)

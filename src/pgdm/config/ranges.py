@@ -103,7 +103,8 @@ def check_early(flat: Mapping[str, object], before: Mapping[str, object]) -> Non
     for key, value in flat.items():
         kind = type(before.get(key))
         if kind is int and isinstance(value, float):
-            continue  # a float key whose default is a whole number, or 1e6 for an int key
+            # May be valid: the key may be a float key with a whole default, or the value 1e6.
+            continue
         if kind in (bool, int, float) and isinstance(value, str | int | float):
             checked[key] = scalar(kind, value, key)
     check_ranges(checked)

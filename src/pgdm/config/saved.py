@@ -53,10 +53,10 @@ def load_config(run_dir: str | os.PathLike[str]) -> ExperimentCfg:
 
 
 def typed(plain: Mapping[str, Any], where: str, run_dir: str) -> ExperimentCfg:
-    """Return stored settings, ``format`` included, as the typed configuration.
+    """Return stored settings as the typed configuration.
 
     Args:
-        plain: plain containers, as `write_config` stores them.
+        plain: plain containers with the key ``format``, as `write_config` stores them.
         where: where they come from, for the messages.
         run_dir: folder of the run.
 

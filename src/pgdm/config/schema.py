@@ -34,7 +34,7 @@ class ExperimentCfg:
     task: TaskCfg
     """The object and the motion it follows."""
     hand: HandCfg
-    """The hand that manipulates it."""
+    """The hand that manipulates the object."""
     pregrasp: PregraspCfg
     """Where an episode starts."""
     method: Annotated[MethodCfg, ChosenBy("name", config_class, tuple(METHODS))]
@@ -64,7 +64,8 @@ class ExperimentCfg:
     total_frames: int
     """Length of the training, frames: control steps summed over all simulations."""
     time_limit_min: float | None
-    """Wall time, summed over all attempts, after which training ends early; None: never [min]."""
+    """Wall time in minutes, summed over all attempts, after which training ends early; None: no
+    limit."""
     num_envs: int
     """Parallel simulations."""
     num_threads: int
@@ -74,8 +75,8 @@ class ExperimentCfg:
     run_dir: str
     """Folder of the run."""
     resume: str
-    """Whether an existing run is resumed: ``auto`` if there is one; ``must`` fails without one,
-    ``never`` fails with one."""
+    """Whether an existing run is resumed. ``auto`` resumes it, or starts a new one; ``must`` fails
+    if there is none; ``never`` fails if there is one."""
     budget: str
     """Label for reports, such as smoke, reduced or paper."""
     keep_replay: bool
@@ -120,8 +121,8 @@ class ExperimentCfg:
         if self.time_limit_min is None and self.usual_days > _MOST_DAYS:
             raise ConfigError(
                 f"total_frames={self.total_frames:,} would take about {self.usual_days / 365:,.0f} "
-                f"years at the usual {self.algo.usual_steps_per_s:,.0f} steps/s; choose fewer, or "
-                "set time_limit_min"
+                f"years at the usual {self.algo.usual_steps_per_s:,.0f} steps/s; choose fewer "
+                "frames, or set time_limit_min"
             )
 
     def _check_hand(self) -> None:
@@ -164,7 +165,9 @@ class ExperimentCfg:
                         f"task.placements[{i}].{name} has {len(value)} numbers, not {size}"
                     )
             if placement.quat is not None and sum(q * q for q in placement.quat) == 0:
-                raise ConfigError(f"task.placements[{i}].quat is zero; no rotation is 1, 0, 0, 0")
+                raise ConfigError(
+                    f"task.placements[{i}].quat is zero; without rotation it is 1, 0, 0, 0"
+                )
 
 
 _MOST_DAYS = 100 * 365
@@ -187,13 +190,13 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 
 def _check_choices(flat: dict[str, object]) -> None:
     for key, valid in _CHOICES.items():
-        # None was refused already where it is not allowed.
+        # Keys that must not be null have been checked before.
         if flat[key] is not None and flat[key] not in valid:
             raise UnknownNameError(f"{key} value", str(flat[key]), valid)
 
 
 def check_device(device: str) -> None:
-    """Check that this machine has the device, which reading a stored run does not require.
+    """Check that this machine has the device. Stored runs can be read without it.
 
     Raises:
         ConfigError: if the machine lacks it.

@@ -29,7 +29,7 @@ class ChosenBy:
     key: str
     """The key, whose value is text."""
     find: Callable[[str], type]
-    """Maps its value to the class, a subclass of ``Base``; raises ConfigError."""
+    """Maps the key's value to the class, a subclass of ``Base``; raises ConfigError."""
     names: tuple[str, ...]
     """Known values, for the messages; ``find`` may accept others too."""
 
@@ -66,8 +66,8 @@ def build(cls: type[T], data: object, path: str = "") -> T:
     Args:
         cls: the dataclass; its fields may be bool, int, float, str, lists or dataclasses, or a
             union of one of these and None.
-        data: a mapping with exactly its fields. A whole number is a valid float, and a float
-            without a fraction (1e6) a valid int; nothing else is converted.
+        data: a mapping with exactly the fields of ``cls``. A whole number is a valid float, and
+            a float without a fraction (1e6) a valid int; nothing else is converted.
         path: dotted key of the data within all settings, for the messages.
 
     Raises:

@@ -55,7 +55,8 @@ def check_task(name: str) -> None:
     """Check the name of one task.
 
     Raises:
-        ConfigError: if there is no such task; a suite or pattern is explained.
+        ConfigError: if there is no such task; for a suite or a pattern, the message says how to
+            run it.
     """
     if name not in available("task"):
         raise unknown_task(name, None)

@@ -44,7 +44,9 @@ _KEYS = {other: ours for others, ours in _MEANT.items() for other in others}
 
 
 def meant(key: str, names: Iterable[str]) -> list[str]:
-    """Return the names probably meant by a key of another library, or by the last part of a name.
+    """Return the names that an unknown key probably means.
+
+    It may be what another library calls them, or have the same last part as they do.
 
     Args:
         key: an unknown key, dotted or not.

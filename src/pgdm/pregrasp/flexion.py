@@ -10,8 +10,11 @@ from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
 
 _SAMPLES = 21  # angles tried from a joint's straight position to each of its limits
-_LEAST_M = 0.01  # a thumb joint closes only if it brings the tip nearer to the palm by more
-_BENDS = 0.5  # other joints close if the tip's motion has a larger cosine to the palm's normal
+# A joint closes the thumb only if it can bring the thumb's tip nearer to the palm by more than
+# `_LEAST_M`. A joint closes another finger if the cosine of the angle between the tip's motion and
+# the palm's normal is larger than `_BENDS`.
+_LEAST_M = 0.01
+_BENDS = 0.5
 
 
 class Flexion:
@@ -66,7 +69,7 @@ class Flexion:
         return self._data
 
     def _gains(self, joint: int, tip: int, centre: np.ndarray) -> list[float]:
-        """Return how much nearer to ``centre`` a joint brings a tip, m, towards each limit."""
+        """Return how much nearer (m) to ``centre`` a joint brings a tip if turned to each limit."""
         gains = []
         for end in self._model.jnt_range[joint]:
             joints, far = self._straight.copy(), []
@@ -85,7 +88,7 @@ class Flexion:
         return (self.first + np.flatnonzero(self.finger_of_joint == finger)).tolist()
 
     def _normal(self, knuckles: np.ndarray, centre: np.ndarray) -> np.ndarray:
-        """Return the unit vector (3,), world frame, along which the fingers but the thumb bend."""
+        """Return the direction (3,), world frame, in which all fingers except the thumb bend."""
         swings = []
         for finger in self._others:
             tip = self._tips[finger]
@@ -98,7 +101,7 @@ class Flexion:
         return unit(swing - along * (along @ swing))
 
     def _closed(self, normal: np.ndarray, centre: np.ndarray) -> np.ndarray:
-        """Return each joint's limit (J,) towards which it closes its finger; NaN if neither."""
+        """Return for each finger joint (J,) the limit that closes its finger; NaN if none does."""
         closed = np.full(len(self.finger_of_joint), np.nan)
         for finger, tip in self._tips.items():
             for joint in self._joints(finger):

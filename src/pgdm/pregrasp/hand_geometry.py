@@ -73,7 +73,8 @@ def opposing_finger(scene: Scene, contact: HandContact) -> int:
     """Return the index of the thumb among the fingers of ``contact``.
 
     It is the finger that ``hand.human_fingers`` assigns to the human thumb; without a complete
-    assignment, the finger whose tip is farthest from the mean of the others', when straight.
+    assignment, the finger whose tip is farthest from the mean of the other tips while all fingers
+    are straight.
     """
     model, index, human = scene.model, scene.index, scene.hand.human_fingers
     if "thumb" in human and len(human) == len(index.fingertips):
@@ -92,7 +93,7 @@ def mean_fingers(scene: Scene) -> np.ndarray:
     """Return finger joint positions (J,) rad of the hand's mean pre-grasp.
 
     Raises:
-        ConfigError: ``hand.mean_fingers_rad`` has another length than the finger joints.
+        ConfigError: ``hand.mean_fingers_rad`` does not have one entry for each finger joint.
     """
     hand = scene.hand
     count = scene.index.num_joints - hand.num_base_joints - hand.num_wrist_joints

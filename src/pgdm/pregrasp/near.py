@@ -1,4 +1,4 @@
-"""Searches for hand poses near an object without contact: pre-grasps for a task that has none.
+"""Searches for a pre-grasp if a task has none: hand poses near the object that do not touch it.
 
 A cross-entropy search over the hand's joints, started from several orientations of the base. It
 minimises, over poses h within the joints' limits,
@@ -67,8 +67,8 @@ class NearPose:
 
 
 Beyond = Callable[[np.ndarray], float]
-"""Maps qpos (nq,) to the largest amount by which the base would leave its permitted range along the
-motion, m or rad."""
+"""Maps qpos (nq,) to the largest amount by which the base would leave its permitted range if it
+followed the motion, m or rad."""
 
 
 def poses_near(
@@ -106,7 +106,7 @@ def poses_near(
     progress("pre-grasp search", STARTS, STARTS)
     if not found:
         raise SceneError(
-            f"found no pose of hand '{scene.hand.name}' near the object that touches nothing; "
+            f"found no pose near the object in which hand '{scene.hand.name}' touches nothing; "
             "move the object elsewhere on the table, or pass a pose with --pregrasp FILE"
         )
     return sorted(found, key=lambda pose: pose.cost)
@@ -209,10 +209,11 @@ class _Search:
 
 
 class _Tendons:
-    """How far joints are outside the ranges of limited tendons, where servos cannot bring them.
+    """How far joints exceed the ranges of limited tendons; servos could not bring them there.
 
     Args:
-        model: a model; only fixed tendons count, whose length is a weighted sum of joint angles.
+        model: a model; only its fixed tendons count (their length is a weighted sum of joint
+            angles).
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:

@@ -67,7 +67,7 @@ class Wanted:
 
     @property
     def is_other_hand(self) -> bool:
-        """Whether the hand is not the task's own: starts stored with the motion do not fit it."""
+        """Whether the hand is not the task's own; starts stored with the motion then do not fit."""
         return self.hand.name != self.own_hand.name
 
 
@@ -134,8 +134,9 @@ def human_hand(
 ) -> Recording:
     """Return the human hand to follow.
 
-    If the library lacks it, it is downloaded, unless it would have to be rebuilt from another
-    package. If there is none, the points of the task's own hand in its pre-grasp are followed.
+    A human hand that the library lacks is downloaded, unless it would have to be rebuilt from
+    another package. Without a human hand, the result has the points of the task's own hand in its
+    pre-grasp.
 
     Raises:
         ConfigError: the task has neither a human hand nor a pre-grasp of its own to follow.

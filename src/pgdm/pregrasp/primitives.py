@@ -14,7 +14,7 @@ def primitive(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     """Return the surface of a geom that is not a mesh, in the geom's frame, m.
 
     Raises:
-        SceneError: the geom's type has no closed surface, such as a plane.
+        SceneError: the geom's type, such as a plane, has no closed surface.
     """
     size, kind = model.geom_size[geom], int(model.geom_type[geom])
     if kind == _G.mjGEOM_BOX:

@@ -20,13 +20,15 @@ from pgdm.sim.scene import Scene
 LIFT_M = 0.02
 """How far the object's centre of mass must rise, the same as for the reward's lift bonus."""
 RAISE_M = 0.1
-"""How far a policy raises the hand, unless a slide reaches its limit before."""
+"""How far a policy raises the hand, unless a slide reaches its limit before that."""
 PRESS_M = 0.03
 """Largest distance that the hand moves in the direction that the palm faces, while it closes."""
 _SHIFT_M, _SPREAD_RAD = 0.01, 0.15  # std: hand's shift; joints that bend no finger
 _PRESS_STEPS, _CLOSE_STEPS, _LIFT_STEPS, _HOLD_STEPS = 8, 20, 25, 15  # control steps
 _FASTEST, _SLOWEST = 4, 16  # control steps in which a finger closes
-_GRIP, _FINGER, _JOINT = (0.3, 1.0), (0.5, 1.0), (0.7, 1.3)  # ranges of factors of full flexion
+# Ranges of random factors: one per policy, one per finger and one per joint. Their product is the
+# share of full flexion.
+_GRIP, _FINGER, _JOINT = (0.3, 1.0), (0.5, 1.0), (0.7, 1.3)
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Quality:
     centre of mass."""
     lift_rate: float
     """Share of random closing policies that lift and hold the object; NaN if not tested, or if the
-    object cannot be lifted, such as a door."""
+    object, such as a door, cannot be lifted."""
 
 
 class LiftTest:
@@ -53,10 +55,10 @@ class LiftTest:
 
     A policy moves the hand a little in the direction that the palm faces, plus a random shift. It
     flexes each finger, at the finger's own random speed, by a random share of the way from its
-    pre-grasp to full flexion, and moves the other finger joints at random. Then it raises the hand
-    by :data:`RAISE_M` and holds it still. It succeeds if the object stays at least :data:`LIFT_M`
-    above its start during the hold. Equal arguments give an equal result, whatever the number of
-    threads.
+    pre-grasp to full flexion, and moves joints that bend no finger at random. Then it raises the
+    hand by :data:`RAISE_M` and holds it still. It succeeds if the object stays at least
+    :data:`LIFT_M` above its start during the hold. Equal arguments give an equal result, whatever
+    the number of threads.
 
     Args:
         scene: scene of the task.

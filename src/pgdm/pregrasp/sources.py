@@ -57,7 +57,7 @@ class StartState:
     source: str  # the pre-grasp source that was used, perhaps the fallback
     qpos: np.ndarray  # (nq,) m, rad
     qvel: np.ndarray  # (nv,) m/s, rad/s
-    sha256: str = ""  # hash of the file, if it is the user's own pre-grasp
+    sha256: str = ""  # of the user's own pre-grasp file; empty for other starts
     reach: ReachStart | None = None  # the plan that ends here, if one is stored
 
 
@@ -115,7 +115,7 @@ def _stored(source: str, motion: Motion, scene: Scene) -> StartState:
 
 
 def _reach(start: Start, pose: np.ndarray, scene: Scene) -> ReachStart | None:
-    """Return the plan of a stored start; at its beginning the objects are as in ``pose`` (nq,).
+    """Return the plan of a stored start; it begins with the objects as in ``pose`` (nq,).
 
     Returns None if there is no plan, or if it is for another hand.
     """
@@ -141,7 +141,7 @@ def reset_pose(scene: Scene, qpos: np.ndarray) -> np.ndarray:
 
 
 def is_reset_pose(scene: Scene, qpos: np.ndarray) -> bool:
-    """Return whether the hand is in its reset pose at qpos (nq,); that is not a pre-grasp."""
+    """Return whether qpos (nq,) has the hand in its reset pose, which is not a pre-grasp."""
     return np.array_equal(qpos[: scene.index.num_joints], scene.index.reset)
 
 

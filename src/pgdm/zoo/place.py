@@ -58,7 +58,7 @@ class Entry:
     deterministic: float
     """Success of the mean action (0..1)."""
     com_error_released: float
-    """Error of the sampled policy, released form, m."""
+    """Error of the sampled policy, as the released code computes it, m."""
     precision: str
     """Precision of the stored weights, ``float16`` or ``float32``."""
     bytes: int
@@ -120,7 +120,7 @@ class Zoo:
         """Return the content of an entry's file, after checking its SHA-256.
 
         Raises:
-            UnknownNameError: if there is none of this name.
+            UnknownNameError: if there is no entry of this name.
             ZooError: if index or file cannot be read, or the file's SHA-256 is not that of the
                 index.
         """

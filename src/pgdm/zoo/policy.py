@@ -33,7 +33,7 @@ def open_entry(zoo: Zoo, name: str) -> TrainedPolicy:
     """Return a policy of a zoo.
 
     Raises:
-        UnknownNameError: if there is none of this name.
+        UnknownNameError: if there is no entry of this name.
         ZooError: if the zoo is damaged.
         CheckpointError: if the policy's file is damaged.
     """
@@ -55,10 +55,10 @@ def add_run(
 ) -> Entry | None:
     """Add the last policy of a finished run to a zoo, in half precision if that is accurate enough.
 
-    It is accurate enough if sampled success and error of the rounded policy are within the 95%
-    intervals of the run's own evaluation (Student's t, over its episodes), or differ by no more
-    than one control step's share of success and an error of 1 mm at every step. The stored
-    evaluation is that of the stored weights.
+    Rounding may change the success and the error of the sampled policy, each by up to half the
+    width of its 95% interval in the run's own evaluation (Student's t over episodes). If that is
+    less, success may change by one control step's share, and the error by as much as 1 mm at every
+    step adds up to. The stored evaluation is that of the stored weights.
 
     Args:
         run: folder of the run.
@@ -69,7 +69,7 @@ def add_run(
         stop: polled during the evaluation; True ends it, and no entry is made.
 
     Returns:
-        The entry, or None if it was stopped.
+        The entry, or None if the evaluation was stopped.
 
     Raises:
         RunError: if the run is not finished.

@@ -28,7 +28,7 @@ contacts are soft."""
 class ReachPlan:
     """A reach plan and where it ends.
 
-    The target is the pre-grasp. Errors are relative to the target, clipped to the hand's ranges.
+    The target is the pre-grasp. It is clipped to the hand's ranges before errors are measured.
     """
 
     actions: np.ndarray = field(repr=False)
@@ -42,9 +42,10 @@ class ReachPlan:
     finger_error_rad: float
     """Largest error of a joint after the base."""
     object_moved_m: float
-    """Distance of the object's centre of mass from its position if the hand stays away."""
+    """Distance of the object's centre of mass from its place if the hand had stayed away."""
     object_turned_rad: float
-    """Angle between the object's orientation and that if the hand stays away."""
+    """Angle between the object's orientation and the one it would have if the hand had stayed
+    away."""
     depth_m: float
     """Deepest penetration between the hand and anything else at the end of the plan."""
     target_depth_m: float

@@ -29,8 +29,8 @@ from pgdm.pregrasp.sources import reset_pose
 from pgdm.sim.scene import Scene
 
 STEPS, SLOW_STEPS, SLOW_S = 40, 60, 0.3
-"""Length of the released plans in control steps; their length for bases with slow servos (D'Manus);
-servo lag, s, above which a base counts as slow."""
+"""``STEPS``: length of the released plans, control steps. ``SLOW_STEPS``: the same for hands whose
+base has slow servos (D'Manus). ``SLOW_S``: servo lag, s, above which a base counts as slow."""
 
 _END_STD = 0.003, 0.02, 0.03
 """First standard deviation of final targets: slides m, hinges rad, joints after the base rad."""
@@ -40,7 +40,7 @@ _SHIFT = 0.7  # largest shift of the goal where servos cannot remove an error, i
 _SLACK = 0.4  # error that is not corrected, in tolerances
 _SPEED_WEIGHT_S = 0.05  # weight of the joints' mean final speed, in tolerances per second
 _CHECKED = 4  # best candidates of a round that are checked for penetration
-_IMPROVED = 0.9  # a round improves the search if it lowers the best cost to below this share
+_IMPROVED = 0.9  # a round is an improvement if the best cost falls below this share of its value
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,8 @@ class ReachCfg:
     """Settings of the search for a reach."""
 
     steps: int | None
-    """Control steps of the plan; None means 40, or 60 for slow base servos (released plans)."""
+    """Control steps of the plan; None means as many as in the released plans: 40, or 60 if the
+    base has slow servos."""
     hold_steps: int
     """Control steps at the end of the plan in which the final targets are held."""
     cem: CemCfg
@@ -72,8 +73,8 @@ class ReachCfg:
         """
         if self.steps is not None and self.steps <= self.hold_steps:
             raise ConfigError(
-                f"a reach of {self.steps} steps has no time to move while the last "
-                f"{self.hold_steps} hold; give it more steps"
+                f"a reach of {self.steps} steps has no time to move: during the last "
+                f"{self.hold_steps} it holds its final targets; give it more steps"
             )
         if not 1 <= self.cem.elites < self.cem.population:
             raise ConfigError(

@@ -15,14 +15,14 @@ from pgdm.sim.scene import Scene, SceneIndex
 class Ends:
     """Final states of N plans.
 
-    The object's displacement and rotation are relative to its pose if the hand stays away.
+    The object's displacement and rotation are relative to the pose it has if the hand stays away.
     """
 
     qpos: np.ndarray  # (N, nq) m, rad
     qvel: np.ndarray  # (N, nv) m/s, rad/s
     moved_m: np.ndarray  # (N,) displacement of the object's centre of mass
     turned_rad: np.ndarray  # (N,) rotation of the object
-    peak_m: np.ndarray  # (N,) largest displacement of its centre of mass during the plan
+    peak_m: np.ndarray  # (N,) largest displacement of the object's centre of mass during the plan
     diverged: np.ndarray  # (N,) bool
 
 
@@ -135,8 +135,8 @@ class Rollouts:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return joint positions near ``joints`` where servos can come to rest, and target offsets.
 
-        First the targets are held at ``joints`` for a second. A servo cannot remove an error that
-        then still exceeds ``nearest``, such as that of joints coupled by a tendon: the aim is
+        First the targets are held at ``joints`` for a second. If an error still exceeds ``nearest``
+        then, servos cannot remove it (joints coupled by a tendon are an example), and the aim is
         shifted by this error, at most by ``farthest``. For another second an integrator finds the
         offsets between targets and aim that remove the remaining error:
 

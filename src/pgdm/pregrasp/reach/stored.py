@@ -22,9 +22,10 @@ TARGETS = ("mined", *(source for source in pregrasp_file.SOURCES if source != "p
 
 
 def pose_of(source: str, motion: Motion, scene: Scene) -> np.ndarray:
-    """Return the pre-grasp of a source, not the state in which a reach ends: whole scene (nq,).
+    """Return the whole scene (nq,) at the pre-grasp of a source.
 
-    The user's own pre-grasp takes precedence over the one stored with the motion.
+    It is the pre-grasp itself, not the state in which a reach to it ends. The user's own pre-grasp
+    takes precedence over the one stored with the motion.
 
     Raises:
         ConfigError: no pre-grasp of this source is stored for the task and hand, or it is only the
@@ -66,8 +67,8 @@ def store(
     """Store a reach plan in the user's folder, and return the path of the file.
 
     A plan to the mined pre-grasp is stored as the user's ``planned`` pre-grasp; a plan to one of
-    the user's own pre-grasps is added to the file of that pre-grasp. A plan to any other pre-grasp
-    is stored with it in a new file, as the user's own pre-grasp of that source.
+    the user's own pre-grasps is added to the file of that pre-grasp. In all other cases a new file
+    gets both the pre-grasp and the plan, as the user's own pre-grasp of that source.
 
     Args:
         scene: scene of the task.

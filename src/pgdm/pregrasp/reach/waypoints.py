@@ -141,7 +141,7 @@ class Waypoints:
         return targets.clip(self._low, self._high)
 
     def _knots(self, candidates: np.ndarray) -> list[np.ndarray]:
-        """Return the reset pose and the waypoints of candidates (N, D), (N, n) each."""
+        """Return the reset pose and the three waypoints, (N, n) each, of candidates (N, D)."""
         layout, base, fingers = self.layout, self._base, self._fingers
         goal = self._goal + candidates[:, layout.ends]
         above, standoff = goal.copy(), goal.copy()

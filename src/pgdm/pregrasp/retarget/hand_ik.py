@@ -33,7 +33,7 @@ CLEARANCE_M = 0.001
 """Distance that obstacle avoidance keeps between the hand and everything else."""
 
 _SOLVER = "daqp"
-_STEPS, _SETTLED = 200, 1e-5  # most steps; converged if all joints change by less, m or rad
+_STEPS, _SETTLED = 200, 1e-5  # most steps; fewer once all joints change by less, m or rad
 _DAMPING = 1e-6
 _MEAN_WEIGHT = 0.006  # per rad; small, since it should only fix joints that the points leave free
 _FAR_M = 0.02  # obstacles farther from the hand than this are ignored
@@ -46,7 +46,7 @@ class IkResult:
     """A pose found by inverse kinematics, with its errors."""
 
     qpos: np.ndarray = field(repr=False)
-    """Whole scene (nq,): the hand's joints, then the objects' as they were."""
+    """Whole scene (nq,): the hand's joints, then those of the objects, unchanged."""
     fingertip_errors_m: np.ndarray
     """Distance of each fingertip from its target (F,)."""
     palm_error_rad: float
@@ -58,7 +58,7 @@ class IkResult:
     at_limit: tuple[str, ...]
     """Names of the joints that are at a limit."""
     slides_at_limit: tuple[str, ...]
-    """Those of them that are slides of the base."""
+    """Those of ``at_limit`` that are slides of the base."""
     targets: Targets = field(repr=False)
     """The targets that the errors refer to."""
 

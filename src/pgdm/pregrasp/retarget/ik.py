@@ -21,7 +21,7 @@ from pgdm.pregrasp.retarget.keypoints import Keypoints
 from pgdm.pregrasp.retarget.targets import Targets
 from pgdm.sim.scene import Scene
 
-# Poses that may be free: how far the fingertips open and the palm backs off.
+# Attempts of `_opened`: how far the fingertips spread, and how far the palm backs off.
 _OPENINGS_M = tuple((opening, lift) for lift in (0.0, 0.01) for opening in (0.006, 0.015, 0.03))
 _FIRST_TRIES = 3  # searches that are always run; more only while no result is good enough
 _RETREATS_M = (0.1, 0.06)  # distances from which the hand approaches the object
@@ -70,13 +70,13 @@ def solve_hand(
 def pushed_out(ik: HandIk, qpos: np.ndarray, targets: Targets, seed: int = 0) -> np.ndarray:
     """Return the scene (nq,) near ``qpos`` with the least penetration, ideally none.
 
-    The cost of leaving the targets, for the hand's points p with errors e_p, weights w_p relative
-    to the largest fingertip weight, and F fingertips, is
+    The cost of leaving the targets is
 
         sum_p w_p e_p (1 + e_p / 1 cm) / F
 
-    It grows faster than the errors, so that they spread over the fingers. Equal arguments give an
-    equal result.
+    with e_p the error of point p, w_p its weight divided by the largest weight of a fingertip, and
+    F the number of fingertips. The cost grows faster than the errors, so that the errors spread
+    over the fingers. Equal arguments give an equal result.
 
     Args:
         ik: inverse kinematics of the scene.

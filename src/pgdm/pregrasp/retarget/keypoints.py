@@ -220,7 +220,7 @@ def _sorted(points: np.ndarray, order: str, label: str) -> np.ndarray:
     else:
         last = joints[:, 2] - joints[:, 1]
         length = np.maximum(np.linalg.norm(last, axis=1, keepdims=True), 1e-12)
-        # In the unit of the points, so that the check can recognise points in millimetres.
+        # Tips are in the unit of the points, so that `check` can recognise millimetres.
         tips = joints[:, 2] + last * (_tip_length(joints) / length)
     return np.concatenate((joints, tips[:, None]), axis=1)
 

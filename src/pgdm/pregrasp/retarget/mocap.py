@@ -1,8 +1,7 @@
 """Turns a recorded human hand into a pre-grasp of a scene's hand.
 
-The human joints come from the library or from a file. If there are none, those of a human hand are
-placed at the points of the task's own hand in its stored pre-grasp, so that any hand has something
-to follow.
+The human joints come from the library or from a file. A task without them gets a substitute to
+follow: a human hand whose joints are at the points of the task's own hand in its stored pre-grasp.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from pgdm.sim.contact import FREE_M
 from pgdm.sim.scene import Scene
 
 FAR_M = 0.05
-"""A pre-grasp is refused if its fingertips are farther from their targets on average."""
+"""A pre-grasp is refused if its fingertips are farther than this from their targets on average."""
 DEEP_M = 0.001
 """A pre-grasp is refused if the hand penetrates something deeper than this."""
 
@@ -173,10 +172,10 @@ def retarget(
         seed: seed of the search that frees the hand.
 
     Raises:
-        ConfigError: there is no such frame, the hand's points do not have the layout that inverse
-            kinematics needs, the object is attached to something and the recording has its poses,
-            or several frames of which none is chosen, or the recorded quaternions seem to be in the
-            order x y z w.
+        ConfigError: there is no such frame; the hand's points do not have the layout that inverse
+            kinematics needs; the recorded quaternions seem to be in the order x y z w; or the
+            object is attached to something, and the recording has either object poses or several
+            frames of which none is chosen.
         CorruptAssetError: the object has no parts to touch.
     """
     objects = object_joints(motion, scene)

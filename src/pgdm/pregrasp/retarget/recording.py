@@ -89,11 +89,11 @@ def parse(arrays: Mapping[str, Any], label: str) -> Recording:
         label: name of the file, for messages.
 
     Raises:
-        ConfigError: the joints are not a right hand in metres, a coordinate of them is not finite,
-            or an order is unknown.
-        CorruptAssetError: an array is missing, is not numeric or has a wrong shape, only one of the
-            object's position and orientation is given, or these are not finite or no unit
-            quaternions.
+        ConfigError: the joints are not a right hand in metres, one of their coordinates is not
+            finite, or an order is unknown.
+        CorruptAssetError: an array is missing, is not numeric or has a wrong shape; only one of the
+            object's position and orientation is given; one of these is not finite; or the
+            quaternions do not have unit length.
     """
     if "joints" not in arrays:
         raise CorruptAssetError(f"{label}: lacks 'joints'; it has {', '.join(sorted(arrays))}")

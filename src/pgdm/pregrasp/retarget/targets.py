@@ -1,4 +1,4 @@
-"""Targets of a robot hand's points with which the robot hand follows a human hand.
+"""Targets for the points of a robot hand that is to follow a human hand.
 
 Each bone keeps its direction in the human hand and gets the robot's length. The bones are chained
 from an anchor, which stays in place: outwards from the wrist, or inwards from the fingers' pads
@@ -18,11 +18,11 @@ from pgdm.sim.scene import Scene
 
 ANCHORS = ("wrist", "pads")
 """The points that stay where the human hand has them: the wrist, as in the published trajectories,
-or the fingers' pads, for robot hands of another size."""
+or the fingers' pads, for robot hands whose size differs from the human hand's."""
 
 LIKE_A_PERSON = 0.8, 1.35
-"""Range of the robot hand's length relative to the human hand's in which they count as about
-equal."""
+"""The two hands count as about equal in size if the robot hand's length, divided by the human
+hand's, is in this range."""
 
 _WEIGHTS = {"wrist": (0.6, 0.6, 0.6, 1.0), "pads": (0.05, 0.05, 0.1, 1.0)}
 """Weights of wrist, knuckles, middle points and distal points (the fingertips), 1/m, by anchor."""
