@@ -71,7 +71,7 @@ class Improvement(NamedTuple):
 
     @property
     def single(self) -> bool:
-        """Whether both have a single run per task; the page then counts tasks instead."""
+        """Whether both settings have a single run per task; the page then shows ``won``."""
         return self.runs == self.than_runs == self.tasks
 
     @property
