@@ -9,7 +9,7 @@ from pgdm.report.results import Results
 from pgdm.report.runs import Run
 from pgdm.report.settings import Setting
 
-# Name on the page -> key in result.json. These depend on the assets of the machine.
+# Name on the page -> key in result.json. The values depend on the assets of the machine.
 _FACTS = {"start": "pregrasp_used", "asset source": "asset_source"}
 
 
@@ -23,7 +23,7 @@ class Mixed(NamedTuple):
 
 
 class Double(NamedTuple):
-    """A run that is left out because another with equal setting, task and seed counts."""
+    """A run that is left out: another one of the same setting, task and seed counts instead."""
 
     run: Run
     differences: list[str]

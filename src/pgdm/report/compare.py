@@ -43,7 +43,7 @@ class Comparison:
     def differences(self) -> dict[str, list[Any]]:
         """Return the settings that differ: key to the value in each run, None if it is missing.
 
-        Only settings that change what a run computes count, and those in ``ALSO``.
+        Compared are the settings that change what a run computes, and those in ``ALSO``.
         """
         keys = sorted({key for settings in self._settings for key in settings})
         rows = {key: [settings.get(key) for settings in self._settings] for key in keys}

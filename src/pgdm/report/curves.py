@@ -38,7 +38,7 @@ class _Scale:
 
     logarithmic: bool
     furthest: float  # frames
-    low: float  # of the values; of their log10 if logarithmic
+    low: float  # lower end of the values, or of their log10 if logarithmic
     high: float
 
     def __call__(self, frames: Array, values: Array) -> Array:
@@ -61,7 +61,7 @@ def curves(
 ) -> dict[str, bytes]:
     """Draw a metric over frames, a panel for each task, and write them as one PNG.
 
-    A single pair of axes holds all panels, since fifty pairs take five times as long.
+    A single pair of axes holds all panels, since fifty pairs would take five times as long to draw.
 
     Args:
         results: the runs.
@@ -187,7 +187,7 @@ def mean_line(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, Array
     """Return frames, mean and standard deviation of curves, up to the end of the shortest.
 
     Args:
-        lines: frames and values of each curve; values between them are interpolated linearly.
+        lines: frames and values of each curve; values in between are interpolated linearly.
     """
     last = min(frames[-1] for frames, _ in lines)
     every = np.unique(np.concatenate([frames for frames, _ in lines]))

@@ -41,7 +41,7 @@ _SHADES = 12  # number of shades of each colour, for antialiased lines
 
 
 def colour(results: Results, setting: Setting) -> str:
-    """Return a setting's colour; more settings than colours reuse them."""
+    """Return a setting's colour; if there are more settings than colours, colours repeat."""
     return COLOURS[results.settings.index(setting) % len(COLOURS)]
 
 
@@ -155,7 +155,7 @@ def _most(estimates: Iterable[Estimate]) -> float:
 
 
 def _extent(rows: Sequence[Average]) -> str:
-    """Return a text on tasks and frames behind a group's bars; all its runs are equally long."""
+    """Return a text: how many tasks a group's bars average, and how long all its runs are."""
     counts = [len(row.tasks) for row in rows]
     least, most = min(counts), max(counts)
     number = f"{least}" if least == most else f"{least} to {most}"
@@ -206,7 +206,7 @@ def line_axes(panels: dict[str, tuple[float, float] | None]) -> tuple[Figure, li
     """Return a figure and its axes, one below the other.
 
     Args:
-        panels: label of each panel to its y-range; None: as the data need.
+        panels: y-range of each panel by its label; None: chosen to fit the data.
     """
     figure = _figure(2.2 * len(panels) + 0.6)
     drawn = list(figure.subplots(len(panels), sharex=True, squeeze=False)[:, 0])

@@ -94,10 +94,10 @@ def validated(results: Results, rows: Sequence[Average]) -> Figure | None:
 
 
 def _runs(results: Results, row: Average) -> dict[str, list[Run]]:
-    """Return the runs to average, for those of a row's tasks in which a run has a curve.
+    """Return the runs of a row to average, by task.
 
-    These are the finished runs of a task or, if there are none, all that have not failed. A curve
-    needs two evaluations.
+    These are the finished runs of a task or, if there are none, all that have not failed. Runs with
+    fewer than two evaluations have no curve and are left out, as are tasks without a curve.
     """
     found = {}
     for task in results.tasks:

@@ -165,7 +165,7 @@ def _films(results: Results, out: Path, progress: StepProgress) -> list[dict[str
 
 
 def _provenance(results: Results) -> list[tuple[str, list[tuple[str, int]]]]:
-    """Return versions and assets behind the runs: each fact, with its values and their runs."""
+    """Return versions and assets behind the runs: each fact, with the runs counted by its value."""
     facts: dict[str, Counter[str]] = {}
     for run in results.runs:
         of_run = {
@@ -185,7 +185,7 @@ def _provenance(results: Results) -> list[tuple[str, list[tuple[str, int]]]]:
 def _commands(results: Results) -> list[str]:
     """Return the commands that reproduce the runs, one per setting.
 
-    A command has every seed for every task, so it starts more runs if tasks differ in seeds.
+    A command has every seed for every task, so it starts further runs if tasks differ in seeds.
     """
     found = []
     for setting in results.settings:

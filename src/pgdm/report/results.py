@@ -29,8 +29,8 @@ class Results:
     """The runs of a report.
 
     Args:
-        runs: all runs; of several with equal setting, task and seed only one counts, and the others
-            go to ``doubles``: a finished run is preferred, then the longest, then the latest.
+        runs: all runs. Of several with equal setting, task and seed only one counts: a finished run
+            is preferred, then the longest, then the latest. The others go to ``doubles``.
     """
 
     def __init__(self, runs: Sequence[Run]) -> None:
@@ -50,7 +50,7 @@ class Results:
             self._cells.setdefault((run.setting, run.task), []).append(run)
 
     def cell(self, setting: Setting, task: str) -> list[Run]:
-        """Return the runs of a setting on a task by seed, in any state."""
+        """Return the runs of a setting on a task, in any state, sorted by seed."""
         return self._cells.get((setting, task), [])
 
     def seeds(self, setting: Setting) -> list[int]:
@@ -85,8 +85,8 @@ class Results:
 
         Args:
             setting: the setting.
-            groups: config groups whose option the paper's table varies too; the option does not
-                count.
+            groups: config groups whose option the paper's table varies too; their options are no
+                deviations.
         """
         found = setting.deviations(*groups)
         wanted = setting.option("pregrasp")

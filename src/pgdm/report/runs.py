@@ -90,7 +90,7 @@ class Run:
 
     @property
     def start(self) -> str:
-        """Source of the start that was used: the requested one, or its fallback."""
+        """Source of the start state that was used: the requested source, or its fallback."""
         return str(self.result.get("pregrasp_used", self.setting.option("pregrasp")))
 
 

@@ -48,7 +48,7 @@ class Setting:
 
     @property
     def own_hand(self) -> bool:
-        """Whether each task uses the hand in its file, as in the paper."""
+        """Whether each task uses the hand that its settings file names, as in the paper."""
         return not self.within("hand")
 
     def within(self, *groups: str) -> tuple[str, ...]:
@@ -64,8 +64,8 @@ class Setting:
         """Return why its results are not comparable with the paper's; empty if they are.
 
         Args:
-            groups: config groups whose option the paper's table varies too; the option does not
-                count.
+            groups: config groups whose option the paper's table varies too; their options are no
+                deviations.
         """
         frames = self.total_frames
         fewer = [f"{frames:,} of {PAPER_FRAMES:,} frames"] if frames < PAPER_FRAMES else []

@@ -42,7 +42,7 @@ class Found:
 
     runs: list[Run] = field(default_factory=list)
     unreadable: dict[str, str] = field(default_factory=dict)
-    """Folder, or plan file of a sweep, to reason."""
+    """Why a run cannot be read, by its folder or by the plan file of its sweep."""
     commands: list[str] = field(default_factory=list)
     """Commands that started the sweeps, if known."""
 
@@ -53,7 +53,7 @@ def find(places: Sequence[str], uri: str | None, out: Path, progress: StepProgre
     Args:
         places: folders, or names of MLflow experiments.
         uri: MLflow store; None: the store in the folder of runs.
-        out: folder to which runs are copied from MLflow if their run folders are not here.
+        out: folder to which runs are copied from MLflow if this machine lacks their run folders.
         progress: called with the number of runs read so far.
 
     Raises:

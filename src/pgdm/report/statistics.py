@@ -29,7 +29,7 @@ class Estimate(NamedTuple):
 
 
 def interquartile_mean(values: Array) -> Array:
-    """Return the mean of the sorted values n//4 < k <= n - n//4 along the last axis (n,)."""
+    """Sort along the last axis, of size n, and return the mean without n//4 values at each end."""
     size = values.shape[-1]
     cut = size // 4
     return np.sort(values, axis=-1)[..., cut : size - cut].mean(axis=-1)
@@ -71,8 +71,8 @@ def profile(scores: Scores, thresholds: Array, seed: int = 0) -> list[Estimate]:
 def improvement(x: Scores, y: Scores, seed: int = 0) -> Estimate:
     """Return the probability that a run of ``x`` beats a run of ``y`` on a random task.
 
-    1/M sum_m 1/(N_m K_m) sum_n sum_k ([x_mn > y_mk] + [x_mn = y_mk] / 2), for the same tasks in
-    the same order.
+    1/M sum_m 1/(N_m K_m) sum_n sum_k ([x_mn > y_mk] + [x_mn = y_mk] / 2), where ``x`` and ``y``
+    have the same tasks in the same order.
     """
     rng = np.random.default_rng(seed)
     drawn = zip(resampled(x, rng), resampled(y, rng), strict=True)

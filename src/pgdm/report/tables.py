@@ -31,8 +31,8 @@ class Average:
     name: str
     """Row of the table: source of pre-grasps, ablation, or method."""
     group: str
-    """How its setting differs in what the table does not vary; only rows with equal groups are
-    comparable. Empty if no row differs."""
+    """How its setting differs from those of the other rows, except in what the table varies; only
+    rows with equal groups are comparable. Empty if there is no such difference."""
     wanted: Callable[[Run], bool]
     """Returns whether a run belongs to the row, by its task."""
     tasks: tuple[str, ...]
@@ -42,9 +42,9 @@ class Average:
     error: Estimate
     rotation: Estimate
     same: dict[str, float]
-    """The paper's average over the same tasks: ``success`` and ``com_error``; NaN unless the row is
-    PGDM with pre-grasps, each task's own hand and no ablation: the paper has values by task only
-    for that."""
+    """The paper's average over the same tasks: ``success`` and ``com_error``. The paper has values
+    by task only for PGDM with pre-grasps, each task's own hand and no ablation; in other rows they
+    are NaN."""
     paper: dict[str, float] = field(default_factory=dict)
     """The paper's own average: ``success``, ``com_error`` and, if stated, ``ori_error`` and
     ``tasks``; empty if the paper has no such row, as for another method's ablation or
@@ -71,7 +71,7 @@ class Improvement(NamedTuple):
 
     @property
     def single(self) -> bool:
-        """Whether both have a single run per task; the page then counts tasks instead."""
+        """Whether both settings have a single run per task; the page then shows ``won``."""
         return self.runs == self.than_runs == self.tasks
 
     @property
@@ -92,7 +92,10 @@ def by_source(results: Results) -> list[Average]:
 
 
 def by_ablation(results: Results) -> list[Average]:
-    """Return the ablations on tcdm30, with the same settings unablated; empty if there are none."""
+    """Return the ablations on tcdm30, and the same settings without ablation.
+
+    Empty if there are no ablations.
+    """
     ablated = [s for s in results.settings if s.option("ablation") != "none"]
     rests = {setting.rest("ablation") for setting in ablated}
     shown = [setting for setting in results.settings if setting.rest("ablation") in rests]
@@ -110,7 +113,7 @@ def by_ablation(results: Results) -> list[Average]:
 def baselines(results: Results) -> list[Average]:
     """Return methods with and without pre-grasps on tcdm30.
 
-    Empty if there is only one method, and only with pre-grasps or only without.
+    Empty if all settings have the same method and either all or none have pre-grasps.
     """
     settings = [s for s in results.settings if s.option("ablation") == "none"]
     if len({(s.method, s.with_pregrasp) for s in settings}) < 2:

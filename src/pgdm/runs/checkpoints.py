@@ -25,8 +25,9 @@ def find_checkpoint(path: Path, best: bool) -> tuple[Path, Path, State]:
 
     Args:
         path: a run folder, or a checkpoint in one.
-        best: for a run folder, whether to take the checkpoint of highest success (if equal, of
-            highest return) with sampled actions, if there is one, instead of the newest usable one.
+        best: for a run folder, whether to take the best checkpoint (of highest success with sampled
+            actions or, among equals, of highest return) instead of the newest usable one. If there
+            is no best checkpoint, the newest usable one is taken.
 
     Raises:
         RunError: if ``path`` is neither, or a link leads out of the run folder.
@@ -81,15 +82,15 @@ class LoadedPolicy:
         """Return actions for a batch of observations.
 
         Args:
-            obs: (N, D), or (D,) for a single one, as the environment returns; NumPy or torch.
+            obs: (N, D), or (D,) for a single one, as the environment returns them; NumPy or torch.
             deterministic: return the policy's mean action instead of a sample.
 
         Returns:
             Actions (N, A) or (A,) float32, NumPy or torch as ``obs``.
 
         Raises:
-            ConfigError: if ``obs`` has neither of these shapes, as when the environment has other
-                settings.
+            ConfigError: if ``obs`` has neither of these shapes, as when the environment's settings
+                are not those of the run.
         """
         rows = torch.as_tensor(obs, dtype=torch.float32)
         if rows.ndim not in (1, 2) or rows.shape[-1] != self.obs_dim:
@@ -107,8 +108,9 @@ def load_policy(run: str | PathLike[str], *, best: bool = False, seed: int = 0) 
 
     Args:
         run: a run folder, or a checkpoint in one.
-        best: for a run folder, whether to take the checkpoint of highest success (if equal, of
-            highest return) with sampled actions, if there is one, instead of the newest usable one.
+        best: for a run folder, whether to take the best checkpoint (of highest success with sampled
+            actions or, among equals, of highest return) instead of the newest usable one. If there
+            is no best checkpoint, the newest usable one is taken.
         seed: seed of the noise of sampled actions.
 
     Raises:

@@ -13,8 +13,8 @@ CONFIG = "config.yaml"
 LOG = "metrics.jsonl"
 RESULT = "result.json"
 LINK = "mlflow.json"
-"""File that names the MLflow run that mirrors this one. Once MLflow is reached, it also has the
-values of `pgdm.runs.folder.FACTS`, which ``result.json`` has only at the end."""
+"""File that names the MLflow run that mirrors this one. Once MLflow is reached, the file also
+has the values of `pgdm.runs.folder.FACTS`, which ``result.json`` has only at the end."""
 LOCK = ".lock"
 """Held by the process that trains in the folder."""
 CHECKPOINTS, VIDEOS = "checkpoints", "videos"

@@ -75,8 +75,8 @@ class RunFolder:
         """The run's settings as plain containers.
 
         Raises:
-            RunError: if ``config.yaml`` is missing, is not valid YAML, holds no mapping or values
-                of wrong types.
+            RunError: if ``config.yaml`` is missing, is not valid YAML, is no mapping or holds
+                values of wrong types.
         """
         config = read_config(self.path)
         if wrong := fault(config, CONFIG_KINDS):
@@ -189,7 +189,7 @@ class RunFolder:
         """Return a hash of the run's records and result.
 
         Raises:
-            RunError: if one exists but cannot be read.
+            RunError: if one of the two files exists but cannot be read.
         """
         digest = hashlib.sha256()
         for file in (self.log.path, self.path / RESULT):
@@ -279,7 +279,7 @@ def claimed(run_dir: Path) -> Iterator[None]:
 
 
 def located(path: Path) -> Path:
-    """Return a path; if it exists only below the folder of runs, return it with that folder.
+    """Return a path; if it exists only below the folder of runs, put that folder before it.
 
     ``pgdm runs`` lists runs relative to the folder of runs.
     """
@@ -326,8 +326,8 @@ def _walk(root: Path) -> Iterator[Path]:
 def runs_root(run_dir: Path) -> Path:
     """Return the folder of runs that a run belongs to, where ``mlflow.db`` is by default.
 
-    For runs below ``runs`` in the working directory it is that folder, else the parent of the
-    run's own folder.
+    If the run is below ``runs`` in the working directory, its folder of runs is ``runs``, else the
+    parent of the run folder.
     """
     run_dir, default = run_dir.absolute(), paths.runs().absolute()
     return default if run_dir.is_relative_to(default) else run_dir.parent

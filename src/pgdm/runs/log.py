@@ -106,7 +106,7 @@ class RunLog:
             raise RunError(f"cannot read {self.path}: {error.strerror or error}") from error
 
     def thinned(self, points: int) -> list[Record]:
-        """Return every evaluation, and about ``points`` of the other records, evenly spread.
+        """Return every evaluation, and about ``points`` other records, evenly spread.
 
         Only these are parsed: a run of 50M frames has 12,000 lines, of which 50 are evaluations.
 

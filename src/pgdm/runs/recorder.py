@@ -64,7 +64,7 @@ class Recorder(Callback):
             outcome = trainer.run()
             ended = outcome.status, outcome.progress, outcome.evaluation
             write_result(self._folder, *ended, self._facts)
-            # Only now, since a run that is not finished needs its replay to resume.
+            # The replay is removed only now: an unfinished run needs it to resume.
             if outcome.status == "finished" and not self._folder.setting("keep_replay"):
                 shutil.rmtree(self._run_dir / REPLAY, ignore_errors=True)
             status = outcome.status

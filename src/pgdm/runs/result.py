@@ -17,7 +17,7 @@ from pgdm.runs.provenance import versions
 
 ENDED_BY, TIME_LIMIT = "ended_by", "time_limit"
 """Key in ``result.json`` of a finished run, and its value if ``time_limit_min`` ended the run. If
-it reached its length, the value is ``frames``."""
+the run reached its length instead, the value is ``frames``."""
 WRIST_BOUND = "wrist_bound"
 """Key in ``result.json``: the wrist plan's ``rigid_grasp``, 0..1."""
 
@@ -64,8 +64,8 @@ def is_whole(
     Args:
         result: contents of its ``result.json``.
         total_frames: length that is wanted now, frames.
-        time_limit_min: limit that is wanted now; None for no limit, 0 for the one that ended the
-            run.
+        time_limit_min: time limit that is wanted now; None: no limit; 0: the limit the run had, so
+            that a run which the limit ended has nothing left to do.
     """
     if result.get("status") != "finished":
         return False

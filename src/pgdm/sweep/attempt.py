@@ -67,7 +67,7 @@ def attempt(
 
 
 def _train_in_slurm(cfg: ExperimentCfg, slurm_id: str, train: Train) -> int:
-    """Train; if Slurm stops the run early but it has made progress, have Slurm requeue the job."""
+    """Train; if Slurm stops the run after some progress, have Slurm requeue the job."""
     folder = Path(cfg.run_dir)
     limit = time.monotonic() + _HANDOVER_S
     while RunFolder(folder).busy and time.monotonic() < limit:  # an earlier process is saving

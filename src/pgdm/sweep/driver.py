@@ -134,8 +134,8 @@ class Driver:
     def _first_state(self, entry: Entry) -> str:
         """Return FINISHED or WAITING.
 
-        A job is finished only if its run folder says so, and either the ledger does too or the
-        folder holds the run of this job.
+        A job is finished only if its run folder says so. In addition, the ledger must say so, or
+        the folder must hold the run of this very job.
         """
         job = self._jobs[entry.key]
         done = job_ending(job).state == FINISHED
@@ -148,7 +148,7 @@ class Driver:
             if stop() and self._launcher.stays:
                 return
             if stop():
-                self._left_over.clear()  # local ones stop by themselves when their driver dies
+                self._left_over.clear()  # local workers stop by themselves when their driver dies
             self._take_over()
             states = self._ledger.states()
             self._ask(
@@ -270,7 +270,10 @@ def _frames(job: Job) -> int:
 
 
 def _last_error(log: Path) -> str:
-    """Return the last line of a log that starts with ``error: ``, or else its last line."""
+    """Return the last error message of a log; if it has none, the last line.
+
+    Lines that start with ``error: `` are error messages.
+    """
     text = log.read_text(errors="replace") if log.exists() else ""
     lines = [line for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("error: ")]

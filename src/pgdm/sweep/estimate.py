@@ -69,7 +69,7 @@ def _frames_done(job: Job) -> int:
     total = job.cfg.total_frames
     try:
         found = run_ending(Path(job.cfg.run_dir), total, job.cfg.time_limit_min)
-    except RunError:  # the job reports it when it starts
+    except RunError:  # the job's worker reports the error
         return 0
     return total if found.state == FINISHED else min(found.frames or 0, total - 1)
 

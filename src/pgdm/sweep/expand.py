@@ -42,8 +42,8 @@ def grid(overrides: Sequence[Override], tasks: Tasks, most: int) -> list[tuple[s
         most: maximum number of jobs.
 
     Raises:
-        ConfigError: if a key has no value to try or an interval of numbers, or there are too many
-            jobs.
+        ConfigError: if there is no value to try for a key, an interval is given instead of values,
+            or there are too many jobs.
     """
     axes: dict[str, list[str]] = {}
     for override in overrides:

@@ -33,7 +33,7 @@ def foresee(
     used_by: dict[object, str] = {}
     lacking, approximate, planned = set(), set(), set()
     for number, cfg in enumerate(cfgs):
-        progress("looking for their assets", number, len(cfgs))
+        progress("looking for the runs' assets", number, len(cfgs))
         motion = cfg.task.motion
         if cfg.action.plans_wrist:
             planned.add(motion)

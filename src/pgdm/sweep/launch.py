@@ -38,7 +38,7 @@ def run_sweep(plan: Plan, sweep: SweepCfg, launcher: LauncherCfg, front: Front) 
     130, 140 or 143: stopped by SIGINT (Ctrl-C), SIGUSR2 or SIGTERM.
 
     Args:
-        plan: the jobs; its folder may hold them in any state.
+        plan: the jobs, some of which may have been started before.
         sweep: how many times a job is tried, and whether to run in the background.
         launcher: where the jobs run, and how many at a time.
         front: the command line.

@@ -58,7 +58,7 @@ class Launcher(Protocol):
         """Start workers.
 
         Raises:
-            SweepError: if they cannot be started; then none of them was.
+            SweepError: if they cannot be started; in that case no worker was.
         """
         ...
 

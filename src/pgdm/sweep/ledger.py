@@ -50,7 +50,7 @@ T = TypeVar("T")
 class Attempt:
     """One process that works or worked on a job; in Slurm one Slurm job, even if it is requeued.
 
-    While it runs, it has no end, exit code, frames, metrics or error.
+    While an attempt runs, it has no end, exit code, frames, metrics or error.
     """
 
     key: str
@@ -98,7 +98,8 @@ class Ending:
 class Ledger:
     """The ledger of the sweep in a folder; the file is created if it is missing.
 
-    Each change is one transaction. If the file is locked, it is retried for up to ``LOCK_S``.
+    Each change is one transaction. While the file is locked, reads and changes are retried for up
+    to ``LOCK_S``.
 
     Args:
         folder: folder of the sweep.
@@ -197,7 +198,7 @@ class Ledger:
         )
 
     def recall(self, key: str, start: float, end: float, ending: Ending) -> None:
-        """Record as attempt 1 what is known only from a job's run folder, unless there is one."""
+        """Record attempt 1 of a job from its run folder, unless the job has an attempt 1."""
         row = (key, ending.state, start, end, ending.frames, json.dumps(ending.metrics))
         self._write(
             "INSERT OR IGNORE INTO attempts (key, number, state, host, pid, born, start, end, "

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class SweepMirror:
-    """Mirrors a sweep to MLflow; if MLflow fails, it reports that once and the sweep continues.
+    """Mirrors a sweep to MLflow; a failure of MLflow is reported once, and the sweep continues.
 
     Args:
         group: the sweep's MLflow run; None mirrors nothing.
@@ -34,8 +34,8 @@ class SweepMirror:
     def of(cls, plan: Plan, notify: Notify) -> SweepMirror:
         """Return the mirror of a plan; it mirrors nothing if no job uses MLflow.
 
-        Store and MLflow experiment are those of the first job that uses MLflow. If its settings
-        name no store, the sweep stays in its own database, or gets one.
+        Store and MLflow experiment are those of the first job that uses MLflow. If that job's
+        settings name no store, the sweep keeps the database that it has, or gets one.
         """
         chosen = next((j.cfg.tracking for j in plan.jobs if j.cfg.tracking.kind == "mlflow"), None)
         if chosen is None:
@@ -60,8 +60,8 @@ class SweepMirror:
             folder: folder of the sweep.
             dead: run folders of workers that were found dead.
             status: how the sweep ended; recorded if ``mlflow.json`` still has it as running.
-            notify: called with a sentence if MLflow fails, or if the store is not that of the
-                sweep or of a folder above it, and so is not changed.
+            notify: called with a sentence if MLflow fails, or if the store is not changed because
+                it is neither in the sweep's folder nor in a folder above.
         """
         link = read_json(folder / LINK)
         running = link.get("status") == RUNNING

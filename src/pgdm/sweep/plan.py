@@ -51,9 +51,10 @@ class LocalCfg:
     max_jobs: int
     """Most jobs at a time; 0: as many as cores and memory allow."""
     cores_per_job: int
-    """Threads of each job whose ``num_threads`` is 0. If this is 0 too: the largest ``num_threads``
-    of any job or, if all are 0, an equal share of the cores. Unless ``max_jobs`` is set, the jobs
-    at a time are at most the cores divided by the resulting number."""
+    """Threads of each job whose ``num_threads`` is 0. If ``cores_per_job`` is 0, such a job gets
+    the largest ``num_threads`` of any job or, if ``num_threads`` is 0 for all jobs, an equal share
+    of the cores. Unless ``max_jobs`` is set, the number of jobs at a time is at most the number of
+    cores divided by these threads."""
     memory_per_job_gb: float
     """Memory to allow for each job [GB]; not used if ``max_jobs`` is set."""
 
@@ -73,7 +74,7 @@ class SlurmCfg:
     constraint: str | None
     """Features that nodes must have; None: any node."""
     time_min: int
-    """Time limit of a Slurm job, which saves shortly before it and is requeued [min]."""
+    """Time limit of a Slurm job [min]; the job saves shortly before the limit and is requeued."""
     cores_per_job: int
     """Cores of each job, and threads of a job that leaves ``num_threads`` at 0."""
     memory_per_job_gb: float
@@ -148,7 +149,7 @@ class Plan:
     name: str
     """Name of the sweep."""
     folder: Path
-    """Folder of the sweep, absolute: ``plan.json``, ``ledger.sqlite``, ``logs/``, and its runs."""
+    """Absolute folder of the sweep; holds ``plan.json``, ``ledger.sqlite``, ``logs/`` and runs."""
     jobs: tuple[Job, ...]
     """No two have the same key."""
     command: str
@@ -157,7 +158,7 @@ class Plan:
 
 def job_key(cfg: ExperimentCfg) -> str:
     """Return 16 hex digits, equal for experiments of equal identity and ``total_frames``."""
-    # An identity omits total_frames, so that a longer run can resume a shorter one; a key has it.
+    # A key includes total_frames; an identity omits it: a longer run may resume a shorter one.
     whole = identity(cfg) | {"total_frames": cfg.total_frames}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 

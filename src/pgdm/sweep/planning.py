@@ -63,7 +63,7 @@ def make_plan(
 def _names(composed: Sequence[Composed]) -> list[str]:
     """Return each job's name: task, the overrides that differ between jobs, and seed.
 
-    Overrides of the other keys in ``NOT_IN_A_NAME`` are left out.
+    Of the keys in ``NOT_IN_A_NAME``, a name has only task and seed.
     """
     given = [
         {key.lstrip("+"): value for key, _, value in (o.partition("=") for o in overrides)}

@@ -86,7 +86,7 @@ class Queue:
         return self._found.get(slurm_id, Standing(GONE))
 
     def forget(self) -> None:
-        """Have the next ``find`` query Slurm, since jobs were submitted."""
+        """Make the next ``find`` ask Slurm again, since jobs were submitted."""
         self._asked_s = -math.inf
 
     @property

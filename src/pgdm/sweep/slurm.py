@@ -65,7 +65,7 @@ def parameters(cfg: SlurmCfg, name: str, at_once: int) -> dict[str, Any]:
         "setup": cfg.setup or None,
         "stderr_to_stdout": True,
         "wckey": None,
-        # Since Slurm 22.05 srun does not inherit this from sbatch, and would give one core.
+        # Since Slurm 22.05 srun does not inherit cpus_per_task from sbatch: it would give one core.
         "srun_args": [f"--cpus-per-task={cfg.cores_per_job}"],
         "additional_parameters": {"requeue": True} | {k: v or True for k, _, v in more},
     }

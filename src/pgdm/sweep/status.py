@@ -84,7 +84,7 @@ class Summary:
     total_frames: int
     left_s: float | None
     """Remaining time of the waiting, running and interrupted jobs, at the mean ``frames_per_s`` of
-    all jobs for which it is known; None if it is for none."""
+    all jobs for which it is known; None if it is known for no job."""
 
 
 def run_ending(run_dir: Path, total_frames: int, time_limit_min: float | None = 0.0) -> Ending:
@@ -93,7 +93,7 @@ def run_ending(run_dir: Path, total_frames: int, time_limit_min: float | None = 
     Args:
         run_dir: folder of the run.
         total_frames: length that is wanted now, frames.
-        time_limit_min: limit that is wanted now; None: no limit, 0: the one that ended the run.
+        time_limit_min: time limit that is wanted now; None: no limit; 0: the limit the run had.
     """
     found = reached(RunFolder(run_dir), total_frames, time_limit_min)
     return Ending(found.status, None, found.frames, found.metrics, found.error)
@@ -111,7 +111,7 @@ def is_alive(attempt: Attempt, run_dir: Path, queue: Queue) -> bool:
 
 
 def parent(ledger: Ledger) -> Process | None:
-    """Return the process that drives the sweep now; None also if it is on another machine."""
+    """Return the process on this machine that drives the sweep now, or None."""
     known = ledger.fact(PARENT)
     process = Process(*known) if known else None
     return process if process is not None and process.alive else None
@@ -170,7 +170,7 @@ def summarize(found: Sequence[Row], slots: int) -> Summary:
 def log_path(folder: Path, name: str, attempt: int) -> Path:
     """Return the file with the output of an attempt at a job."""
     safe = "".join(c if c.isalnum() or c in "=.,+-" else "_" for c in name)
-    if len(safe) > _LONGEST:  # jobs may differ only at the end
+    if len(safe) > _LONGEST:  # names may differ only at the end
         safe = f"{safe[:_LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     return folder / LOGS / f"{safe}.{attempt}.log"
 
@@ -185,7 +185,7 @@ def _row(folder: Path, entry: Entry, queue: Queue) -> Row:
             ending = replace(run_ending(entry.run_dir, entry.total_frames), state=WAITING)
         elif is_alive(last, entry.run_dir, queue):
             lines = RunFolder(entry.run_dir).log.tail(_TAIL_BYTES)
-            # Evaluations are rare; the episodes of an iteration have sampled actions as well.
+            # Evaluations are rare, so show the success in training, which samples actions too.
             shown = {SUCCESS: _last(lines, "train/success")}
             ending = Ending(RUNNING, None, _last(lines, "frames"), shown, None)
         else:
@@ -216,7 +216,8 @@ def _row(folder: Path, entry: Entry, queue: Queue) -> Row:
 def _in_slurm(attempt: Attempt, run_dir: Path, queue: Queue) -> tuple[str | None, bool]:
     """Return an attempt's ID and state in Slurm, or None, and whether it waits to start.
 
-    If Slurm cannot be queried, it counts as waiting unless its run folder shows it as running.
+    If Slurm cannot be queried, the attempt counts as waiting unless the run folder shows the run
+    as running.
     """
     if attempt.slurm_id is None:
         return None, False
@@ -234,6 +235,6 @@ def _pace(last: Attempt | None, lines: Sequence[Record], frames: int) -> float |
 
 
 def _last(lines: Sequence[Record], name: str) -> Any:
-    """Return the last finite value that was recorded of a metric, or None."""
+    """Return the last finite value that was recorded for a metric, or None."""
     values = (line[name] for line in reversed(lines) if name in line)
     return next((v for v in values if isinstance(v, int | float) and math.isfinite(v)), None)

@@ -25,7 +25,7 @@ NOT_IN_A_NAME = (
 
 def studies(config_dir: str | Path | None = None) -> dict[str, Path]:
     """Return the sweep files by name; pgdm's file hides a user's of the same name."""
-    # pgdm's are next to conf/, both in a checkout and in an installed package.
+    # pgdm's sweep files are next to conf/, both in a checkout and in an installed package.
     places = [conf_dir().parent, *folders(config_dir)[1:]]
     own_last = [file for folder in places for file in (folder / "sweeps").glob("*.yaml")]
     return dict(sorted((file.stem, file) for file in reversed(own_last)))
@@ -37,12 +37,12 @@ def open_study(
     """Read the sweep file that ``+sweep=NAME`` names.
 
     Returns:
-        The name of the sweep file, None if there is none; the other overrides; and the overrides
-        in the file, which must be applied before the others.
+        The name of the sweep file, or None; the overrides without ``+sweep``; and the overrides in
+        the sweep file, which must be applied first.
 
     Raises:
         UnknownNameError: if there is no such sweep file.
-        ConfigError: if several are given, or the file is wrong.
+        ConfigError: if several sweep files are given, or the file is wrong.
     """
     named = [o.partition("=")[2] for o in overrides if o.partition("=")[0] == _KEY]
     typed = [o for o in overrides if o.partition("=")[0] != _KEY]

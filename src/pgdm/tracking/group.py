@@ -17,7 +17,7 @@ class Group:
     Args:
         folder: folder of the group; its ``mlflow.json`` names the group's run.
         uri: store of the group.
-        experiment: MLflow experiment of its runs.
+        experiment: MLflow experiment of the group's runs.
     """
 
     def __init__(self, folder: Path, uri: str, experiment: str) -> None:
@@ -46,9 +46,9 @@ class Group:
         write_json(self.folder / LINK, {**link, "status": "running"})
 
     def adopt(self, run_dir: Path) -> None:
-        """Have the MLflow run of a run folder nested under the group's, in the same store.
+        """Let the MLflow run of a run folder be nested under the group's, in the same store.
 
-        Only ``mlflow.json`` is written: the run's own tracker or ``pgdm runs sync`` reads it.
+        Only ``mlflow.json`` is written; the run's own tracker or ``pgdm runs sync`` reads it later.
         """
         run_dir.mkdir(parents=True, exist_ok=True)
         parent = {"run_id": self._link.get("run_id"), "uri": self.uri}

@@ -115,7 +115,7 @@ class MlflowTracker(Tracker):
         self._not_before = 0.0
 
     def _connected(self) -> Mirror:
-        """Return the mirror; the first call opens it, and sends earlier records that it lacks."""
+        """Return the mirror; the first call opens it, and sends records that MLflow lacks."""
         if self._mirror is not None:
             return self._mirror
         store = Store.open(self._uri, self._cfg.experiment)

@@ -55,7 +55,10 @@ METRICS = (
         "hand_error_m", "both", "m", "mean distance of fingertips from the expert's, over the steps"
     ),
     Metric(
-        "hand_error_rad", "both", "rad", "mean angle of wrist and finger joints to the expert's"
+        "hand_error_rad",
+        "both",
+        "rad",
+        "mean difference of wrist and finger joints from the expert's",
     ),
     Metric(
         "contact_distance_m",

@@ -41,7 +41,7 @@ STATUS = {
     "failed": "FAILED",
 }
 _BATCH, _PARAMS = 1000, 100  # the server's limits: metrics and parameters per call
-_MACHINE_KEYS = ("run_dir", "resume")  # not parameters: the folder may move and is a tag
+_MACHINE_KEYS = ("run_dir", "resume")  # not parameters: a run may move, and its folder is a tag
 # Without this tag MLflow's pages open on its view for traces of language models.
 _EXPERIMENT_TAGS = {"mlflow.experimentKind": "custom_model_development"}
 _LOCK_S = 120.0
@@ -113,8 +113,8 @@ def connect(uri: str) -> MlflowClient:
     os.environ.update(environment())
     from mlflow import MlflowClient
 
-    # The first two log each step of creating a database; what urllib3 warns of is also raised as an
-    # exception.
+    # mlflow and alembic log each step of creating a database; the errors that urllib3 warns of are
+    # raised as exceptions as well.
     for name, level in (("mlflow", "WARNING"), ("alembic", "WARNING"), ("urllib3", "ERROR")):
         logging.getLogger(name).setLevel(level)
     return MlflowClient(tracking_uri=uri)
@@ -140,7 +140,7 @@ def one_line_errors(where: str) -> Iterator[None]:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its type if it has none."""
+    """Return the first line of an error's message or, if that is empty, the error's type."""
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
@@ -253,7 +253,7 @@ class Mirror:
         self._params = dict(run.data.params)
 
     def link(self, news: Mapping[str, Any]) -> None:
-        """Record in ``mlflow.json`` which MLflow run mirrors the folder, and ``news``."""
+        """Record in ``mlflow.json`` which MLflow run mirrors the folder, and add ``news``."""
         mine = {"run_id": self.run_id, "uri": self._store.uri}
         write_json(self._folder.path / LINK, {**self._folder.link, **news, **mine})
 

@@ -151,7 +151,7 @@ def history(store: Store, run: Run) -> History:
 
 
 def lacking(wanted: list[Point], there: History) -> list[Point]:
-    """Return the points without the metrics that MLflow has."""
+    """Return the points, each without those of its metrics that MLflow already has."""
     return [
         (step, at, {name: value for name, value in m.items() if step not in there.get(name, {})})
         for step, at, m in wanted
