@@ -201,7 +201,7 @@ def test_trial_is_shown_and_saved(tab: Tab, page: LabelPage) -> None:
     until(lambda: page.idle)
     tab.click_button("Start pose")
     tab.click_button("Try it")
-    tab.wait("document.body.innerText.includes('of random closing policies lift it')", PATIENCE_S)
+    tab.wait("document.body.innerText.includes('closing policies lift the object')", PATIENCE_S)
     until(lambda: page.idle)
     assert "the hand reaches the pose" in tab.text()
     tab.click_button("Save")

@@ -10,7 +10,7 @@ from torch import Tensor
 from pgdm import rotations
 from pgdm.library import Expert, Motion
 
-# Control steps ahead whose targets are observed (released code).
+# The targets this many control steps ahead are observed (released code).
 STEPS_AHEAD = (1, 5, 10)
 # Frequencies of the encoding of time (released code).
 TIME_FREQUENCIES = (1, 4, 6, 8)
@@ -40,7 +40,7 @@ class ObjectReference:
 
     @classmethod
     def of(cls, motion: Motion) -> ObjectReference:
-        """Return a stored motion as a reference, with positions as in ``released``."""
+        """Return a stored motion as a reference, with the positions unchanged (``released``)."""
         return cls(torch.as_tensor(motion.translation), torch.as_tensor(motion.orientation))
 
     def com_corrected(self, com: Tensor) -> ObjectReference:

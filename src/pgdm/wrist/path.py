@@ -26,9 +26,9 @@ _STEADY_M = 0.003  # position error, m, that costs as much as a hinge change of 
 
 @dataclass(frozen=True)
 class GraspPoint:
-    """The point of the hand that is at the motion's first target at the start.
+    """The point of the hand that, at the start of an episode, is at the motion's first target.
 
-    The object's centre of mass should be there, too.
+    The object's centre of mass should start there, too.
     """
 
     offset: np.ndarray  # (3,) m, in the frame of the body that the point is fixed to
@@ -95,9 +95,10 @@ def feasible_path(index: SceneIndex, reference: ObjectReference, start: Tensor) 
 
         min  |s - clip(s)|^2 + |TURN_M log(R_carried^-1 R(a))|^2 + |0.003 (a - a_before)|^2
 
-    in m and rad, where clip limits s to the slides' ranges: position has priority over the carried
-    orientation, and that over a small change since the previous step. The solver starts once from
-    the previous step's hinges and once from the carried path's; the better result is kept.
+    in m and rad, where clip limits s to the slides' ranges. Position has priority over the carried
+    orientation, and orientation over a small change since the previous step. The solver
+    starts once from the previous step's hinges and once from the carried path's; the better result
+    is kept.
 
     Args:
         index: index of the scene.

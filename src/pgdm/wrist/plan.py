@@ -17,7 +17,7 @@ from pgdm.wrist.search import REAL_STAGE, SMOOTH_STAGE, Search
 __all__ = ["WristPlan", "WristProblem", "plan_wrist", "simulate"]
 
 NEAR_M = 0.01
-"""A step counts towards the rigid grasp if its error is at most this, the same as for success."""
+"""A step counts towards the rigid grasp if its error is at most this; same limit as for success."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class WristPlan:
     def rigid_grasp(self) -> float:
         """Share of the steps with the grasp point within 1 cm of its target (0..1).
 
-        This is the success of a grasp that never slips under these commands, *rigid grasp* in
-        reports. A policy may exceed it, since it corrects the commands.
+        Under these commands, a grasp that never slips would have this success. Reports call it
+        *rigid grasp*. A policy may exceed this value, since a policy corrects the commands.
         """
         return float((self.error_m <= NEAR_M).mean())
 

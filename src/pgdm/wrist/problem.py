@@ -60,7 +60,7 @@ class WristProblem:
             )
 
     def target_steps(self) -> np.ndarray:
-        """Return the step of the motion that the hand should follow, (T,): 0 during the hold."""
+        """Return for each step (T,) the motion's step that the hand should follow, 0 in a hold."""
         step = np.arange(len(self.reference))
         return np.where(step <= self.hold_steps, 0, step)
 

@@ -33,15 +33,16 @@ class Limits:
 
 
 class Model:
-    """The cost of a change d (K * 6,) of the commands, where L is ``PER_LIMIT`` and clip
-    limits joint positions to ``limits``:
+    """The cost of a change d (K * 6,) of the commands:
 
         |r + J d|^2 + |L (q + B d - clip(q + B d))|^2
+
+    L is ``PER_LIMIT``, and clip(q) is q clipped to ``limits``.
 
     Args:
         jacobian: Jacobian of the residuals, J (R, K * 6).
         residuals: residuals at the commands, r (R,).
-        joints_by: Jacobian of the joint positions by the commands, B (K * 6, K * 6).
+        joints_by: Jacobian of the joint positions with respect to the commands, B (K * 6, K * 6).
         joints: joint positions at the commands, q (K, 6) m, rad.
         limits: ranges that the joints should stay in.
     """
@@ -60,12 +61,12 @@ class Model:
         self._weights = np.tile(PER_LIMIT, len(joints))
 
     def least(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the change of the commands with the least cost between bounds, all (K, 6).
+        """Return the change (K, 6) of the commands, between bounds (K, 6), that costs least.
 
-        Each round solves min 1/2 d'Hd + g'd with low <= d <= high. The limit term is included only
-        for joints that the previous round's change takes beyond a limit. Rounds end when the change
-        stays the same, when the solver fails, or after six. Of these changes, and no change at
-        all, that of least cost is returned.
+        Each round minimises a quadratic 1/2 d'Hd + g'd with low <= d <= high. It includes the limit
+        term only for joints that the previous round's change takes beyond a limit. The search ends
+        when the change stays the same, when the solver fails, or after six rounds. The best change
+        of all rounds is returned, or no change if none lowers the cost.
         """
         low, high = low.ravel(), np.maximum(high, low + _TINY).ravel()
         best = step = np.zeros_like(low)

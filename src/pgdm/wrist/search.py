@@ -2,28 +2,29 @@ r"""Gauss-Newton on the commands of all control steps at once, with finite-diffe
 
 The base's servos are soft and underdamped: if a path is sent to them unmodified, the hand lags and
 overshoots by centimetres. The search therefore minimises over all commands together. Control step
-k = 0..K-1 leads to pose k+1 of the motion. In this step, u_k are the targets of the six base
-joints; after it, q_k are the base joint positions, R_k is the palm's orientation, and g_k the grasp
-point (a point fixed to the palm, at the motion's first target at the start). p_k is pose k+1 of the
-feasible path of `pgdm.wrist.path`, and u_{-1} = p_{-1}. The target x_k is the position in pose k+1
-of the motion, and R*_k the palm's orientation in pose k+1 of the feasible path; during a hold both
-are those of pose 0. The cost is
+k = 0..K-1 leads to pose k+1 of the motion. During step k, u_k are the targets of the six base
+joints. After step k, q_k are the base joint positions, R_k is the palm's orientation, and g_k the
+grasp point (a point fixed to the palm, which starts at the motion's first target). p_k is pose k+1
+of the feasible path of `pgdm.wrist.path`, and u_{-1} = p_{-1}. The target x_k is the position in
+pose k+1 of the motion, and R*_k the palm's orientation in pose k+1 of the feasible path; during a
+hold, x_k and R*_k are those of pose 0. The cost is
 
     sum_k  w_k |100 (g_k - x_k)|^2  +  w_k |0.9 log(R*_k^-1 R_k)|^2      follow the motion
            + |C (u_k - u_{k-1})|^2  +  |0.2 C (u_k - p_k)|^2             smooth, near the path
            + |L (q_k - clip(q_k))|^2                                     keep off the joint limits
 
 in m and rad, with w_k = 0 while the hand catches up after a hold (see `WristProblem.hold_steps`),
-else 1; C = diag(2, 2, 2, 0.6, 0.6, 0.6), L = diag(300, 300, 300, 90, 90, 90). ``clip`` limits to
-the joint ranges less a margin.
+else 1; C = diag(2, 2, 2, 0.6, 0.6, 0.6), L = diag(300, 300, 300, 90, 90, 90). clip(q_k) is
+q_k clipped to the joint ranges, narrowed by a margin.
 
-Let s be the positions and velocities of the base and wrist joints, s_{k+1} = f(s_k, u_k) one
-control step, F = df/ds and G = df/du by one-sided finite differences. The chain rule gives
+Let s be the positions and velocities of the base and wrist joints, and s_{k+1} = f(s_k, u_k) one
+control step. F = df/ds and G = df/du are computed by one-sided finite differences. Let u be all
+commands, S_k = ds_k/du, and E_k the matrix with E_k u = u_k. The chain rule gives
 
-    S_0 = 0,   S_{k+1} = F_k S_k + G_k E_k,   S = ds/du,   E_k u = u_k
+    S_0 = 0,   S_{k+1} = F_k S_k + G_k E_k
 
-and with it the residuals' Jacobian; `quadratic.Model` then computes the step d subject to
-max(low - u, -trust) <= d <= min(high - u, trust), with the control range from low to high. The
+and from S follows the Jacobian of the residuals. `quadratic.Model` then computes the step d subject
+to max(low - u, -trust) <= d <= min(high - u, trust), where the control range is low to high. The
 trust region grows and shrinks with the ratio of actual to predicted decrease.
 """
 
@@ -51,9 +52,10 @@ from pgdm.wrist.quadratic import Limits, Model
 _PER_M, _PER_RAD = 100.0, 0.9
 _MARGIN = np.repeat((0.005, 0.03), SLIDES)  # m and rad: distance of joints from their limits
 _CHANGE, _NEAR_PATH = np.repeat((2.0, 0.6), SLIDES), 0.2
-_STEP, _STEP_PER_S = 1e-4, 1e-3  # of finite differences: m and rad, m/s and rad/s
-# Ratios of actual to predicted decrease: below the first the trust region shrinks, above the second
-# it grows.
+# Steps of finite differences: of positions (m and rad) and of velocities (m/s and rad/s).
+_STEP, _STEP_PER_S = 1e-4, 1e-3
+# The trust region shrinks if the ratio of actual to predicted decrease is below `_POOR_RATIO`, and
+# grows if it is above `_GOOD_RATIO`.
 _POOR_RATIO, _GOOD_RATIO = 0.3, 0.75
 _ENOUGH = 0.01  # a stage ends once a step lowers the cost by less than this share
 _LEAST_TRUST = 1e-3  # a stage also ends once the trust region is below this, m and rad
@@ -121,7 +123,7 @@ class Search:
         self._followed = ((step <= hold) | (step > 2 * hold))[1:, None]
 
     def improve(self, commands: np.ndarray, stage: Stage, real: bool) -> np.ndarray:
-        """Return commands (K, 6) of lower cost, or the same if no step lowers it.
+        """Return commands (K, 6) of lower cost, or the given ones if no step lowers the cost.
 
         Args:
             commands: commands to start from, (K, 6) m and rad.

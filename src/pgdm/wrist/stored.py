@@ -34,7 +34,7 @@ class WristPlans:
         run: the run's folder; None without a run.
         notify: called with a sentence when a plan is missing, unusable or computed, when it cannot
             be stored, and when another process is computing it.
-        progress: called with the planner's progress; with None, missing plans are not computed.
+        progress: called with the planner's progress; if None, missing plans are not computed.
         num_threads: number of threads of the planner; 0 takes one per core.
     """
 
@@ -145,7 +145,7 @@ def read(path: Path, problem: WristProblem, any_version: bool = False) -> WristP
 
 
 def _is_finite(array: object, shape: tuple[int, ...]) -> bool:
-    # No other number type: `WristPlan.sha256` hashes the commands' bytes.
+    # Other number types are refused, because `WristPlan.sha256` hashes the commands' bytes.
     if not (isinstance(array, np.ndarray) and array.dtype == np.float64):
         return False
     return array.shape == shape and bool(np.isfinite(array).all())

@@ -26,15 +26,16 @@ REACH_TOLERANCE_RAD = 0.2
 """Largest error of a finger joint at the end of the simulated motion: Adroit's weak servos lag by
 0.1 rad where tendons couple two joints."""
 RETREAT_STEP_M, SLOW_STEP_M = 0.001, 0.005
-"""Step sizes of the search over retreats: with fingers in the requested pose, and with fingers that
-stop early."""
+"""Step sizes of the search over retreats. ``RETREAT_STEP_M`` is for fingers in the requested pose,
+``SLOW_STEP_M`` for fingers that stop early."""
 FINGER_LENGTH_M = 0.1
 """Converts a joint error to a fingertip error, to compare it with a retreat of the hand."""
 _SHORT_M = 0.001  # a distance is reported as too short if it falls short by more
-_FINGER_FRACTIONS = np.linspace(0.0, 1.0, 51)  # of the way to the pose, where fingers may stop
+# Shares of the way to the requested pose at which fingers may stop.
+_FINGER_FRACTIONS = np.linspace(0.0, 1.0, 51)
 _RETREAT_STEPS, _FINGER_STEPS, _HOLD_STEPS = 8, 25, 10  # control steps of 0.04 s
 _EXACT_M = 1e-9
-_TRIALS = 3  # most poses that are tried in the simulation
+_TRIALS = 3  # largest number of poses that are tried in simulation
 
 
 @dataclass(frozen=True)
@@ -89,13 +90,13 @@ class Ablated:
     object_moved_m: float
     """How far the fingers pushed the object in simulation; in the start it is back in place."""
     simulated: bool
-    """Whether a simulation has moved the fingers there; else the pose is only set kinematically."""
+    """Whether the fingers moved to the pose in simulation; else it is only set kinematically."""
     depth_m: float
     """Deepest penetration between the hand and anything else."""
 
     @property
     def deviation_m(self) -> float:
-        """Retreat of the hand plus the finger error, converted to an error of the tip."""
+        """``retreat_m`` plus the fingertip error that corresponds to ``finger_error_rad``."""
         return self.retreat_m + FINGER_LENGTH_M * self.finger_error_rad
 
     def facts(self) -> dict[str, str]:
@@ -132,14 +133,19 @@ def ablate(cfg: AblationCfg, start: StartState, scene: Scene, substeps: int) -> 
 
     The hand is at rest and keeps its orientation; the object keeps its pose and velocity. The hand
     moves by ``cfg.distance_m`` along the straight line towards its reset position, if need be past
-    it, up to the limit of a slide. If the hand then penetrates something, deeper than in the stored
-    start or than :data:`OVERLAP_M`, one of two compromises is made, whichever deviates less: the
-    hand retreats further, back, up or away from the object; or, if the ablation changes the finger
-    pose, each finger stops at the first contact on its way from the pre-grasp, perhaps also with a
-    retreat. The second is checked in simulation: the fingers must come near their pose without
-    pushing the object. If the three best such poses fail, the hand retreats instead. There is no
-    simulation if the stored start already penetrates deeply. Equal arguments give an equal result.
-    An ablation that removes nothing returns the stored start.
+    it, up to the limit of a slide. If the hand then penetrates something deeper than
+    :data:`OVERLAP_M`, or deeper than in the stored start, one of two compromises is made, whichever
+    deviates less:
+
+    - the hand retreats further: back, up or away from the object
+    - if the ablation changes the finger pose: each finger stops at the first contact on its way
+      from the pre-grasp, and the hand may retreat as well
+
+    Poses with stopped fingers are checked in simulation: the fingers must come near their pose
+    without pushing the object. If the three best of these poses fail, the hand retreats instead. If
+    the stored start already penetrates deeply, the simulation is skipped.
+
+    Equal arguments give an equal result. An ablation that removes nothing returns the stored start.
 
     Args:
         cfg: the ablation.
@@ -219,7 +225,10 @@ class _Ablation:
         )
 
     def stopped(self, limit: float) -> list[Ablated]:
-        """Return free poses with fingers that stop early, deviation below a limit, best first."""
+        """Return free poses with fingers that stop early, best first.
+
+        Only poses that deviate by less than ``limit``, m, are returned.
+        """
         poses: list[Ablated] = []
         for retreat in np.arange(0.0, limit, SLOW_STEP_M):
             for direction in self._retreats if retreat > 0 else self._retreats[:1]:
@@ -238,7 +247,7 @@ class _Ablation:
         """Return a pose if the hand gets there in simulation without pushing the object, else None.
 
         The object may be moving at the start: a second simulation, with the hand in its reset pose,
-        shows its undisturbed motion.
+        shows the object's undisturbed motion.
         """
         index, goal = self._scene.index, pose.start.qpos
         n, driven = index.num_joints, index.driven

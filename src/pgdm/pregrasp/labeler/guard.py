@@ -20,7 +20,7 @@ HOST = "127.0.0.1"
 VISER = "1.1.1"
 """Version of viser whose private interface :func:`secure` was checked against."""
 _TUNNELS = ("ShareUrlRequest", "ShareUrlDisconnect")
-"""Messages with which a page asks the server to open a public tunnel to itself, and to close it."""
+"""Messages with which a page asks the server to open or close a public tunnel to the server."""
 
 
 @contextlib.contextmanager

@@ -25,7 +25,8 @@ _FINGERS = {
     **dict.fromkeys(("lf", "pf"), "little"),
     **dict.fromkeys(("th", "tf"), "thumb"),
 }
-# By hand, and by the end of a joint's name in the model; other hands show the model's names.
+# Labels by hand, then by the ending of the joint's name in the model. For hands that are not listed
+# here, the page shows the model's names.
 _JOINTS: dict[str, dict[str, str]] = {
     "adroit": {
         **{"WRJ1": "bend sideways", "WRJ0": "bend"},
@@ -121,16 +122,16 @@ def joints(scene: Scene) -> list[Joint]:
 
 
 def _world_axis(scene: Scene, joint: int) -> int:
-    """Return the world axis (0 to 2) nearest to a base joint's axis at base joints of zero."""
+    """Return the world axis (0 to 2) nearest to a base joint's axis if all base joints are zero."""
     turned = np.empty(3)
     mujoco.mju_rotVecQuat(turned, scene.model.jnt_axis[joint], scene.index.mount_quat)
     return int(np.abs(turned).argmax())
 
 
 def _finger_name(model: mujoco.MjModel, point: str, joints: list[int]) -> str:
-    """Return a finger's name from its joints, since D'Manus's points have names of other fingers.
+    """Return a finger's name, from its joints: D'Manus's points are named after other fingers.
 
-    If the joints' names are unknown, it comes from the name of the finger's point.
+    If the joints' names are unknown, the name comes from the finger's point.
     """
     prefix = model.joint(joints[0]).name.rpartition("/")[2][:2].lower() if joints else ""
     return _FINGERS.get(prefix) or _FINGERS.get(point[:2]) or re.sub(r"[_]?point$", "", point)

@@ -13,9 +13,9 @@ TIP_TOLERANCE_M = 1e-4
 """A fingertip has reached its target if it is closer than this."""
 _ITERATIONS = 40
 _STEP_M = 0.02  # longest step of a fingertip towards its target: the Jacobian is only local
-_DAMPING_M = 0.004  # of the least squares, lambda in `Kinematics.reach_tip`
-_BEYOND_WEIGHT = 1e6  # cost of an angle's excess over its limits, relative to its change
-_PULL = 0.1  # share of the way to rest that a step takes in the fingertip Jacobian's null space
+_DAMPING_M = 0.004  # lambda of the damped least squares in `Kinematics.reach_tip`
+_BEYOND_WEIGHT = 1e6  # cost of exceeding a limit by 1 rad, relative to a change by 1 rad
+_PULL = 0.1  # share of the way to ``rest`` that a step goes, in the null space of the Jacobian
 
 
 class Kinematics:
@@ -100,7 +100,7 @@ class Kinematics:
 
             dq = J# e + (I - J# J) p        J# = J^T (J J^T + lambda^2 I)^-1
 
-        Joints at a limit that would exceed it are left out of a step.
+        Joints that are at a limit and would exceed it are left out of a step.
 
         Args:
             qpos: the last pose (nq,).

@@ -17,8 +17,8 @@ Action = Callable[[], None]
 class Mailbox:
     """Runs actions posted by any thread, in order, on a thread of its own.
 
-    Of consecutive waiting actions with the same key, other than None, only the last one runs: the
-    updates of a drag do not pile up when they come faster than they can be computed.
+    Of consecutive waiting actions with the same key (other than None), only the last runs. So the
+    updates of a drag do not pile up if they come faster than they can be computed.
 
     Args:
         complain: receives the error message if an action fails.

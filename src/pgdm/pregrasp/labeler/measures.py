@@ -13,8 +13,8 @@ from pgdm.sim.contact import FREE_M, FingertipDistance
 from pgdm.sim.scene import Scene
 
 BEYOND = 0.01
-"""A joint counts as outside its actuator's range if it exceeds it by more, m or rad: some ranges
-are rounded."""
+"""How far (m or rad) a joint may exceed its actuator's range without counting as outside: some
+ranges are rounded."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Metrics:
     links: frozenset[int]
     """Ids of the hand's bodies that penetrate something by more than 0.1 mm."""
     tip_distances_m: np.ndarray
-    """Distance from the surface of each finger's last link to the object's, (F,); negative if it
-    penetrates."""
+    """Distance between the surfaces of each finger's last link and of the object, (F,); negative if
+    the link penetrates the object."""
     beyond: tuple[str, ...]
     """Joints whose position is outside their actuator's range."""
 
@@ -111,7 +111,7 @@ class Meter:
 
 
 def _parts(model: mujoco.MjModel, num_base: int, fingers: list[names.Finger]) -> list[str]:
-    """Return the name of the hand's part that each body belongs to, for all bodies."""
+    """Return for each body the name of the part of the hand that the body belongs to."""
     wrist = list(range(num_base, min(finger.joints[0] for finger in fingers)))
     part = [names.FOREARM if wrist else names.PALM] * model.nbody
     base = {int(model.jnt_bodyid[joint]): names.PALM for joint in wrist}

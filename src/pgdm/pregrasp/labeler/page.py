@@ -30,7 +30,7 @@ class LabelPage:
         draft: keeps the unsaved pose.
         shapes: visible shapes and collision shapes.
         substeps: physics steps per control step.
-        port: port to listen on, on this machine only; the next free one if it is taken.
+        port: port to listen on, on this machine only; if it is taken, the next free port is used.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class LabelPage:
         self.dragged: object = None
         """The handle being dragged: ``wrist`` or the index of a finger; None if none is."""
         self._drags = 0
-        self._saved = False  # whether this page has saved the stored pose
+        self._saved = False  # whether the stored pose is from this page
         self._trial: Trial | None = None
         self._outcome: tuple[int, Outcome] | None = None  # version of the tried state, outcome
         self.mailbox = Mailbox(lambda text: self.panel.complain(text))
@@ -111,15 +111,15 @@ class LabelPage:
         self.mailbox.post(action, gesture)
 
     def drag_wrist(self, pos: np.ndarray, quat: np.ndarray, phase: str) -> None:
-        """Move the wrist to its handle: (3,) m, (4,) wxyz; phase start, update or end."""
+        """Move the wrist to its handle's pose, (3,) m and (4,) wxyz; phase: start, update, end."""
         self._drag("wrist", phase, lambda g: self.state.place_wrist(pos, quat, g))
 
     def drag_tip(self, finger: int, pos: np.ndarray, phase: str) -> None:
-        """Move a fingertip to its handle: (3,) m; phase start, update or end."""
+        """Move a fingertip to its handle's position, (3,) m; phase: start, update, end."""
         self._drag(finger, phase, lambda g: self.state.place_tip(finger, pos, g))
 
     def _drag(self, handle: object, phase: str, move: Callable[[object], object]) -> None:
-        """Follow a drag; when released, the handle returns to where the hand could get."""
+        """Follow a drag; at its end, the handle returns to the hand, which may not have kept up."""
         self._drags += phase == "start"
         gesture = "drag", handle, self._drags
 

@@ -37,7 +37,7 @@ class Commands:
     try_it: Callable[[], None]
     cancel: Callable[[], None]
     save: Callable[[bool], None]
-    """Called with whether to save even if the hand touches something or an earlier pose is lost."""
+    """Called with True to save even if the hand touches something or a stored pose is replaced."""
     handles: Callable[[str], None]
     solid: Callable[[bool], None]
 
@@ -189,7 +189,7 @@ def _rank(group: str) -> tuple[int, str]:
 
 
 def _handler(action: Callable[[Any], None]) -> Callable[[Any], Coroutine[Any, Any, None]]:
-    """Return a viser callback; as a coroutine, because viser runs those in the order of events."""
+    """Return a viser callback: a coroutine, since viser runs coroutines in the order of events."""
 
     async def handle(event: Any) -> None:
         action(event)

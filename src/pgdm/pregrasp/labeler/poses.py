@@ -30,8 +30,8 @@ PRESETS = ("mined", "planned", "learned", "mocap", "teleop", "labeled", "mean", 
 DEFAULTS = ("labeled", "planned", "mined", "mocap", "none")
 """By default the labeler starts from the first of these that exists."""
 AUTOSAVE_S = 1.0
-"""Interval at which the draft is saved: if the labeler is killed, at most the
-changes of this time are lost."""
+"""Interval at which the draft is saved. If the labeler is killed, at most the changes since the
+last save are lost."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Poses:
     def __init__(self, scene: Scene, motion: Motion) -> None:
         self._scene, self._motion = scene, motion
         self._n = scene.index.num_joints
-        self._base = reset_state(motion, scene)  # its objects are used in every pose
+        self._base = reset_state(motion, scene)  # every pose has the objects as here
 
     def available(self) -> list[str]:
         """Return the presets that exist."""
@@ -71,8 +71,8 @@ class Poses:
 
         Args:
             name: one of :data:`PRESETS`, or the path of a pre-grasp file.
-            wrist: joints (n,) whose base and wrist joints the presets ``mean`` and ``open`` keep;
-                by default those of :meth:`first`.
+            wrist: hand joints (n,); only for the presets ``mean`` and ``open``, which keep its base
+                and wrist joints and set the fingers. By default the pose of :meth:`first`.
 
         Raises:
             UnknownNameError: the name is neither a preset nor a path.
@@ -145,8 +145,8 @@ class Poses:
         if beyond.max() > 1e-3:  # smaller excesses are rounding errors of the released files
             worst = self._scene.model.joint(int(beyond.argmax())).name
             notes += (
-                f"{int((beyond > 1e-3).sum())} joints of the {origin} exceeded their limits and "
-                f"were clipped, {worst} the most by {beyond.max():.3f} m or rad",
+                f"joints of the {origin} that exceeded their limits and were clipped: "
+                f"{int((beyond > 1e-3).sum())}, {worst} the most, by {beyond.max():.3f} m or rad",
             )
         return Loaded(np.concatenate((inside, self._base[self._n :])), origin, notes)
 
@@ -174,7 +174,7 @@ def pregrasp(
 
     Args:
         state: the pose.
-        reached: state in which a reach to the pose ends, if there is one.
+        reached: final state of a reach to the pose; None without a reach.
         anyway: whether the hand may touch something.
         extra: further entries of the note.
 
@@ -233,9 +233,9 @@ class Draft:
         self._thread.start()
 
     def found(self, poses: Poses) -> Loaded | None:
-        """Return the draft that an earlier labeler left, or None.
+        """Return the draft that a previous run of the labeler left, or None.
 
-        If the draft is unusable, rename it and return the default pose with a note on that.
+        If the draft is unusable, rename it and return the default pose with a note that says so.
         """
         if not self._path.is_file():
             return None
@@ -248,7 +248,7 @@ class Draft:
             return replace(loaded, notes=(*loaded.notes, f"{error}; kept as {aside.name}"))
 
     def set_aside(self) -> Path:
-        """Rename the draft that an earlier labeler left, and return its new path."""
+        """Rename the draft that a previous run left, and return its new path."""
         aside = self._path.with_name(f"{SOURCE}.draft-before.npz")
         self._path.replace(aside)
         return aside

@@ -19,7 +19,7 @@ SOLID_RGB = np.array([0.55, 0.62, 0.95])
 _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], np.float32)  # MuJoCo's default: use the material
 _LAST_GROUP = 2  # MuJoCo's viewers show geom groups 0 to 2
 _CREASE_RAD = 0.6  # edges sharper than this are not smoothed
-_MAX_FACES = 3000  # per mesh; larger ones are simplified, such as servos with screw threads
+_MAX_FACES = 3000  # per mesh; larger meshes, such as servos with screw threads, are simplified
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def _seen(model: mujoco.MjModel, body: int) -> list[int]:
     shown = [g for g in _geoms(model, body) if model.geom_group[g] <= _LAST_GROUP]
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     looks = [g for g in shown if is_mesh[g] and not _collides(model, g)]
-    # Visual meshes are shown even if transparent: some bodies of the released files have no others.
+    # Even transparent visual meshes are shown: some bodies of the released files have only these.
     if looks:
         solid_too = [g for g in shown if not is_mesh[g] and not _collides(model, g)]
         return looks + [g for g in solid_too if _alpha(model, g) > 0]

@@ -17,8 +17,8 @@ MAX_UNDO = 500
 class LabelState:
     """A pose of the hand in a scene with fixed objects.
 
-    Every change keeps the joints within their limits. It is a new step of the undo history, unless
-    it belongs to the same gesture as the last step, such as one drag.
+    Every change keeps the joints within their limits. A change is a new step of the undo history,
+    unless it continues the gesture of the last step, such as a drag.
 
     Args:
         scene: scene of the task, with any hand.
@@ -68,7 +68,7 @@ class LabelState:
         """Set all joint positions of the hand, (n,) m and rad.
 
         Raises:
-            ConfigError: there are too many or too few, or a value is NaN or infinite.
+            ConfigError: the number of joints is wrong, or a value is NaN or infinite.
         """
         joints, before = self._checked(joints), self._joints
         continues = self._rested(gesture)
@@ -81,7 +81,7 @@ class LabelState:
         self._move(joints, gesture)
 
     def place_wrist(self, pos: np.ndarray, quat: np.ndarray, gesture: object = None) -> None:
-        """Bring the wrist to (3,) m and the mount body to (4,) wxyz, world frame, within limits."""
+        """Move the wrist to ``pos`` (3,) m, turn the mount body to ``quat`` (4,); world frame."""
         if not (np.isfinite(pos).all() and np.isfinite(quat).all() and np.linalg.norm(quat) > 0.1):
             raise ConfigError(
                 f"the wrist cannot go to {pos}, {quat}: not a finite pose with a nonzero quaternion"
@@ -89,7 +89,7 @@ class LabelState:
         self.set_joints(self.kinematics.place_wrist(self._qpos, pos, quat), gesture)
 
     def place_tip(self, finger: int, target: np.ndarray, gesture: object = None) -> float:
-        """Bring a fingertip as near to a point (3,) m, world frame, as its finger can.
+        """Bring a fingertip as near as its finger can to a point (3,) m, world frame.
 
         Returns:
             The fingertip's distance from the point, m.

@@ -32,7 +32,7 @@ class Outcome:
     """Result of a trial."""
 
     reached: Start | None
-    """State in which the reach ends, with its plan; None if the plan fails to reach the pose."""
+    """State in which the planned reach ends; None if it fails to reach the pose."""
     note: Mapping[str, Any]
     """Metrics as plain JSON, for the note of the pre-grasp's file."""
 
@@ -49,7 +49,7 @@ class Trial:
         qpos: the pose to try (nq,).
         substeps: physics steps per control step.
         on_progress: receives the progress (0..1) and its description.
-        on_state: receives the states of the plan (nq,) in real time; returns False to stop.
+        on_state: receives states (nq,) of the planned reach in real time; returns False to stop.
         on_end: receives the outcome (None if cancelled or failed) and its description.
     """
 
@@ -146,4 +146,4 @@ def _reach_text(plan: ReachPlan) -> str:
 def _lift_text(lift: float) -> str:
     if math.isnan(lift):
         return "the object cannot be lifted"
-    return f"{lift:.0%} of random closing policies lift it"
+    return f"{lift:.0%} of random closing policies lift the object"

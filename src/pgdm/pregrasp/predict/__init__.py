@@ -1,6 +1,6 @@
 """Pre-grasps predicted from an object's shape.
 
-The object is encoded as its distances from fixed points around it, the hand's pose relative to the
-object as a grasp vector. Grasp vectors are modelled by a Gaussian whose mean is linear in the
-distances.
+An object is encoded as the distances of its surface from fixed points around it. A hand's pose
+relative to the object is converted to a grasp vector. Grasp vectors are modelled by a Gaussian
+whose mean is linear in the distances.
 """

@@ -112,7 +112,7 @@ def free_ones(
 
 
 def freed(scene: Scene, qpos: np.ndarray, seed: int = 0) -> np.ndarray | None:
-    """Return a state (nq,) near ``qpos`` in which the hand is free, or None if none is found.
+    """Return a state (nq,) near ``qpos`` in which the hand is free; None if no such state is found.
 
     The hand then keeps a clearance of 0.5 mm from everything but itself. Objects stay, joints
     stay within their limits, and equal arguments give an equal result.

@@ -44,8 +44,8 @@ def encode(points: np.ndarray) -> np.ndarray:
     """Return the distance from each basis point to the nearest of an object's points, (B,).
 
     Args:
-        points: points of the object's surface (n, 3) m, relative to its centre of mass, in world
-            axes, because the possible grasps depend on how the object lies.
+        points: points of the object's surface (n, 3) m, relative to its centre of mass. They are in
+            world axes, because the possible grasps depend on how the object lies.
 
     Returns:
         Distances in units of :data:`BASIS_RADIUS_M`.

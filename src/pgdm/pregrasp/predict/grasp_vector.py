@@ -71,8 +71,8 @@ class GraspFrame:
     def qpos(self, vector: np.ndarray, objects: np.ndarray) -> np.ndarray:
         """Return the scene's state (nq,) with the hand at a grasp vector.
 
-        If the base would exceed its limits, base and wrist joints within the limits are chosen that
-        minimise the squared error of the positions of fingertips and palm; the fingers stay.
+        If the base would exceed its limits, the base and wrist joints are optimised within their
+        limits, for the least squared position error of fingertips and palm; the fingers stay.
 
         Args:
             vector: grasp vector (9+J,).

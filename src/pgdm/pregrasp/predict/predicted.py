@@ -19,7 +19,7 @@ from pgdm.pregrasp.reach.planner import plan_reach
 from pgdm.pregrasp.sources import reset_state
 from pgdm.sim.scene import Scene
 
-_TRIES = 3  # most candidates to plan a reach for; if all plans fail, the best candidate is used
+_TRIES = 3  # plan a reach for at most this many candidates; if all fail, use the best one
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class PredictCfg:
     samples: int = 8
     """Largest number of candidates that are lift-tested."""
     seed: int = 0
-    """Seed of samples, of the search that frees them, of lift test and reach plan."""
+    """Seed of the samples, the search that frees them, the lift test and the reach plan."""
     reach: bool = True
     """Whether to plan the reach."""
 
@@ -43,7 +43,7 @@ class Predicted:
     chosen: int
     """Index of the chosen candidate."""
     plan: ReachPlan | None
-    """Reach plan that ends at the chosen candidate; None if no plan succeeded or was asked for."""
+    """Reach plan that ends at the chosen candidate; None if none was asked for or succeeded."""
     pregrasp: Pregrasp
     """The chosen candidate, with the final state of its plan, if any, and a note on its origin."""
 

@@ -4,17 +4,17 @@ Given an object's code c (`encoding`), the grasp vector (`grasp_vector`) is dist
 
     v ~ N(m + (c - c_0) W, S)
 
-with c_0 and m the means of the examples' codes and vectors. With the rows of X and Y the examples'
-codes and vectors minus these means, W is the ridge regression
+where c_0 and m are the means of the examples' codes and vectors. The rows of X and Y are the
+examples' codes and vectors, minus these means; W is the ridge regression
 
     W = X^T (X X^T + penalty var(X) I)^-1 Y
 
-with var(X) the total variance of the codes, taken as at least 0.5.
+where var(X) is the total variance of the codes, or 0.5 if that is larger.
 
-Each object is held out in turn: the penalty is chosen for the least fingertip error on the held-out
-objects, and S is 0.7^2 times the second moment of the vectors' errors there. With some 40
-pre-grasps this predicts better than networks trained by gradient descent
-(``benchmark/predictor_networks.py``).
+Each object is held out in turn, and its grasp vectors are predicted from the other objects. The
+penalty is the one with the least fingertip error of these predictions, and S is 0.7^2 times the
+second moment of the errors of the predicted vectors. With some 40 pre-grasps this predicts
+better than networks trained by gradient descent (``benchmark/predictor_networks.py``).
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ PENALTIES = (0.3, 1.0, 3.0, 10.0, 30.0)
 """Ridge penalties to choose from, relative to the total variance of the codes."""
 SPREAD = 0.7
 """Standard deviation of the samples relative to that of the held-out errors. Less than 1, because
-among few candidates those far from the mean are rarely the best: the fingertip error of the best of
-8 candidates is 36 mm with this value, and 38 mm with 1."""
+among few candidates those far from the mean are rarely the best: with 0.7 the best of 8 candidates
+has a fingertip error of 36 mm, with 1 it has 38 mm."""
 LEAST_OBJECTS = 2
 _LEAST_VARIANCE = 0.5
-"""Lower bound of the codes' total variance in the ridge penalty. The variance of 32 objects is 3.4,
-of ten 0.9; if it is lower than 0.5, all objects have about the same shape, and small differences,
-such as how they lie, must have little effect."""
+"""Lower bound of the codes' total variance in the ridge penalty. The variance is 3.4 for
+32 objects and 0.9 for ten. If it is below 0.5, all objects have about the same shape, and small
+differences, such as how the objects lie, must have little effect."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Predictor:
-    """A fitted predictor of one hand."""
+    """A fitted predictor of one hand, for codes (B,) and grasp vectors (D,), from n examples."""
 
     hand: str
     anchor_m: np.ndarray = field(repr=False)  # (3,) in the palm's frame
@@ -81,7 +81,7 @@ class Predictor:
     """Mean distance of the predicted fingertips from the stored ones, on objects held out in turn.
     Slightly optimistic, since the penalty was chosen to minimise it."""
     mean_hand_error_m: float
-    """The same error if the prediction is the other objects' mean vector, whatever the shape."""
+    """The same error of a predictor that ignores the shape: it predicts the other objects' mean."""
 
     def expected(self, code: np.ndarray) -> np.ndarray:
         """Return the mean grasp vector (D,) for an object's code (B,)."""

@@ -36,8 +36,8 @@ class Layout:
     size: int
     """Length of an observation."""
     joints: dict[int, slice]
-    """Slices of the observation that hold joint positions, by the first index in qpos that they
-    are written to."""
+    """Slices of the observation that hold joint positions. The key of a slice is the index in qpos
+    at which it is written."""
     palm: slice
     """Slice that holds the world position (3) of ``palm_site``, m."""
     palm_site: str
@@ -177,8 +177,8 @@ def cut(scene: Scene, made: Replay, objects: np.ndarray, origin: str) -> Pregras
     Args:
         scene: scene of the task.
         made: the demonstration set in this scene.
-        objects: joint positions of the objects at the task's start (nq - n,). They replace the
-            demonstration's, such as those of a door that was brushed open.
+        objects: joint positions of the objects at the task's start (nq - n,). They replace those in
+            the demonstration, where a door, for instance, may have been brushed open.
         origin: the demonstration's file, for messages.
 
     Raises:
@@ -224,7 +224,7 @@ def cut(scene: Scene, made: Replay, objects: np.ndarray, origin: str) -> Pregras
 
 
 def nearest(replays: list[Replay]) -> Replay:
-    """Return the demonstration that takes hold with the object nearest to the task's.
+    """Return, of the demonstrations that take hold, the one with the object nearest to the task's.
 
     Raises:
         ConfigError: no demonstration takes hold within the slides' ranges.
