@@ -26,12 +26,12 @@ def ensure(
     root: Path | None = None,
     progress: StepProgress | None = None,
 ) -> Library:
-    """Open the library; if it lacks the task, fetch or compile it.
+    """Open the library; if the task is missing, fetch or compile it.
 
     Args:
         task: task id, which is also the id of its motion.
         offline: never download; earlier downloads are used.
-        notify: receives one line if a package is fetched or read; by default the log.
+        notify: receives one line if a package is fetched or read; by default, the log does.
         root: the library, by default the one under ``PGDM_HOME``.
         progress: receives the progress of a fetch; by default ``notify`` does, every few seconds.
 
@@ -103,7 +103,7 @@ class _Request:
 
 
 def _compiled(library: Library) -> Library:
-    """Return the library after compiling the motions that come with pgdm, if out of date."""
+    """Return the library; first compile the motions that come with pgdm if they are out of date."""
     if animated.is_current(library):
         return library
     root = library.root
@@ -126,7 +126,7 @@ def ensure_expert(
     Args:
         task: task id.
         offline: never download; earlier downloads are used.
-        notify: receives one line if a package is fetched or read; by default the log.
+        notify: receives one line if a package is fetched or read; by default, the log does.
         root: the library, by default the one under ``PGDM_HOME``.
         progress: receives the progress of a fetch; by default ``notify`` does, every few seconds.
 
