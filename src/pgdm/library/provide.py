@@ -71,7 +71,7 @@ class _Request:
     expert: bool = False
     """Whether an expert trajectory is requested, not a task."""
     rebuilt: bool = False
-    """Whether the trajectory has to be rebuilt from a second package."""
+    """Whether the trajectory has to be rebuilt from a second package, the one with MyoHand."""
 
     def filled(self, root: Path, has_it: Callable[[Library], bool]) -> Library:
         """Fetch what is missing unless another process just did, and open the library again.
@@ -121,7 +121,7 @@ def ensure_expert(
     root: Path | None = None,
     progress: StepProgress | None = None,
 ) -> Library:
-    """Open the library; if it lacks the task or its expert hand trajectory, fetch them.
+    """Open the library; fetch the task and its expert hand trajectory if they are missing.
 
     Args:
         task: task id.

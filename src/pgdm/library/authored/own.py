@@ -137,7 +137,7 @@ def add_model(
         kind: ``objects`` or ``hands``.
         name: the model's name.
         make: writes the model into the empty folder it is given; returns notes for the manifest.
-        origin: name of the file from which it was made.
+        origin: name of the file from which the model was made.
         licence: the model's licence.
 
     Returns:
