@@ -80,7 +80,7 @@ def test_keyframes_become_a_task_that_runs(brick: str) -> None:
     shown = command("pgdm", "assets", "show", "brick-lift")
     assert shown.code == 0 and "source own (serves the task)" in shown.out, shown.err
     with pytest.raises(
-        LibraryError, match="object 'brick' is used by brick-lift; remove that task first"
+        LibraryError, match="tasks that use object 'brick': brick-lift; remove it first"
     ):
         own.remove("brick")
     # The user's pre-grasps are for one motion: with another they are set aside.

@@ -291,7 +291,7 @@ def test_a_checkout_with_fewer_tasks_replaces_another_only_with_the_option(
     import_tcdm(checkout, library)
     before = snapshot(library)
     (checkout / "trajectories" / "cup_pour1.npz").unlink()
-    with pytest.raises(LibraryError, match=r"1 tasks now in the library .*cup-pour1.*--replace"):
+    with pytest.raises(LibraryError, match=r"this folder lacks: 1 .*cup-pour1.*--replace"):
         import_tcdm(checkout, library)
     assert snapshot(library) == before
     assert "cup-pour1" not in import_tcdm(checkout, library, replace=True).tasks

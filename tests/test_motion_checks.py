@@ -109,7 +109,9 @@ def test_the_lowest_point_counts(kind: str, size: str, half: float) -> None:
     turned = [np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0]
     motion = Poses(np.outer(heights, [0, 0, 1]), np.tile(turned, (4, 1)))
     assert table.depths(motion) == pytest.approx([0, 0, 0.02, 0], abs=1e-9)
-    with pytest.raises(ConfigError, match=r"20 mm below the table in row 2 \(1 such rows\)"):
+    with pytest.raises(
+        ConfigError, match=r"20 mm below the table in row 2 \(rows that are too low: 1\)"
+    ):
         table.check(motion, "it")
     table.check(table.lifted(motion), "it")
 

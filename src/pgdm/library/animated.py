@@ -77,7 +77,7 @@ def read(task: str) -> AnimatedTask:
 
 
 def origin() -> str:
-    """Return the origin for the source's manifest, which includes a hash of all keyframe files."""
+    """Return the origin, with a hash of all keyframe files, for the source's manifest."""
     digest = hashlib.sha256(str(_FORMAT).encode())
     for task in TASKS:
         digest.update((FOLDER / f"{task}.yaml").read_bytes())
@@ -100,7 +100,7 @@ def fill(root: Path, library: Library) -> None:
     Raises:
         UnknownNameError: the library lacks an object.
         LibraryError: the library has neither ``checkout`` nor ``registry``.
-        CorruptAssetError: an object or a file of keyframes is damaged.
+        CorruptAssetError: an object or a keyframe file is damaged.
     """
     files: dict[str, FileEntry] = {}
     tasks: dict[str, TaskEntry] = {}

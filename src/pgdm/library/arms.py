@@ -61,7 +61,7 @@ def ensure_panda(
 
 
 def _intact(root: Path) -> Path | None:
-    """Return the arm's MJCF file, or None unless all the arm's files have their recorded hashes."""
+    """Return the arm's MJCF file; None if any of the arm's files is missing or changed."""
     folder = staging.folder_of(root, ARMS)
     if folder is None:
         return None
@@ -79,7 +79,7 @@ def fill(root: Path, archive: Path, progress: StepProgress) -> None:
     Args:
         root: the library.
         archive: wheel of the package ``robohive``.
-        progress: receives the number of files.
+        progress: receives the number of files unpacked.
 
     Raises:
         CorruptAssetError: a file of the package is damaged.

@@ -153,7 +153,7 @@ class SourceBuilder:
         return f"{kind}/{name}" in self._models
 
     def lacking(self, task: str) -> list[str]:
-        """Return the hand and objects of a task that were not added, such as ``object 'cup'``."""
+        """Return which of a task's hand and objects were not added, such as ``object 'cup'``."""
         hand = hand_of(task)
         result = [] if self.has("hands", hand) else [f"hand '{hand}'"]
         return result + [f"object '{o}'" for o in objects_of(task) if not self.has("objects", o)]

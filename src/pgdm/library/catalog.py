@@ -35,16 +35,16 @@ _PARTIAL = (staging.OWN, staging.ANIMATED)
 class Library:
     """The assets under one root and the user's own assets, as listed when the library was opened.
 
-    The source that serves a task provides its hand, objects, scene and motion; it is the first that
-    has the task, of ``own``, ``checkout``, ``registry``, ``animated``. ``pgdm assets use`` puts
-    ``registry`` before ``checkout``, or back. Exceptions: the user's objects and hands always come
-    from ``own``. For a motion of ``own`` or ``animated``, all other hands and objects and the table
-    come from ``checkout`` or ``registry``, by precedence. Each motion is read once: its arrays are
-    shared, so copy them before changing any.
+    The source that serves a task provides its hand, objects, scene and motion. It is the first of
+    ``own``, ``checkout``, ``registry``, ``animated`` that has the task; ``pgdm assets use`` chooses
+    whether ``checkout`` or ``registry`` comes first. Exceptions: the user's objects and hands
+    always come from ``own``. For a motion of ``own`` or ``animated``, all other hands and objects
+    and the table come from ``checkout`` or ``registry``, by precedence. Each motion is read once:
+    its arrays are shared, so copy them before changing any.
 
-    Methods that look up a task, model or motion raise LibraryError if the library is empty. If they
-    return a file or its content, they also raise it if the file is missing, and CorruptAssetError
-    if the file has changed since it was recorded.
+    Methods that look up a task, model or motion raise LibraryError if the library is empty. Those
+    that return a file or its content also raise LibraryError if the file is missing, and
+    CorruptAssetError if the file has changed since it was recorded.
 
     Args:
         root: the library's folder.
@@ -63,7 +63,7 @@ class Library:
         return dict(self._sources)
 
     def promising(self, task: str, entry: TaskEntry) -> Library:
-        """Return this library with a task added to ``own`` whose files are not yet written."""
+        """Return this library plus a task of ``own``; the task's files need not be written yet."""
         empty = Manifest(source=staging.OWN, origin="", imported_at="")
         own = self._sources.get(staging.OWN, empty)
         grown = dataclasses.replace(own, tasks={**own.tasks, task: entry})
@@ -172,7 +172,8 @@ class Library:
         """Return provenance and quality of a task's expert hand trajectory.
 
         Raises:
-            UnknownNameError: the task has no expert trajectory; lists the tasks that have one.
+            UnknownNameError: the task has no expert trajectory; the message lists the tasks that
+                have one.
         """
         index = self.experts()
         if task not in index.experts:
@@ -186,7 +187,8 @@ class Library:
         """Read a task's expert hand trajectory.
 
         Raises:
-            UnknownNameError: the task has no expert trajectory; lists the tasks that have one.
+            UnknownNameError: the task has no expert trajectory; the message lists the tasks that
+                have one.
             CorruptAssetError: the trajectory's file is damaged.
             LibraryError: the trajectory's length differs from the motion's.
         """
@@ -203,7 +205,7 @@ class Library:
         return expert
 
     def files(self) -> Iterator[tuple[str, Path, FileEntry]]:
-        """Yield name (for messages), path and entry of every recorded file, experts' included."""
+        """Yield name (for messages), path and entry of every recorded file, also of experts."""
         for source, manifest in self._sources.items():
             for name, entry in manifest.files.items():
                 yield f"{source}/{name}", self._folders[source] / name, entry
@@ -252,7 +254,7 @@ class Library:
 
     @property
     def is_filled(self) -> bool:
-        """Whether ``checkout`` or ``registry`` is present, which have the table and the hands."""
+        """Whether a source with table and hands is present: ``checkout`` or ``registry``."""
         return bool(self._whole())
 
     def _whole(self) -> list[str]:
@@ -293,7 +295,7 @@ class Library:
         return path
 
     def _check_unchanged(self, source: str, relative: str) -> None:
-        """Check a file's hash against the manifest, once; of a model, all files in its folder."""
+        """Check a file's hash against the manifest, once; for a model, all hashes in its folder."""
         if (source, relative) in self._unchanged:
             return
         model = f"{relative.rpartition('/')[0]}/" if relative.endswith(".xml") else relative

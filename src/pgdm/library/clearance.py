@@ -17,7 +17,7 @@ CLEARANCE_M = 0.0005
 """Clearance kept from object and table, m: the contact margin of the benchmark's models."""
 
 _ROUNDS, _ELITES, _ADDED = 40, 8, 0.02
-_OBJECT_HEIGHT_M = 0.2  # of its body at joint positions of zero, as in the tasks
+_OBJECT_HEIGHT_M = 0.2  # height of the object's body at joint positions of zero, as in the tasks
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class FreeingCfg:
     """Settings of :func:`free_by_search`: step sizes, cost weights, effort."""
 
     slide_m: float
-    """Standard deviation of the first samples of slide joints."""
+    """Standard deviation of slide joints in the first round of samples."""
     hinge_rad: float
-    """Standard deviation of the first samples of hinge joints."""
+    """Standard deviation of hinge joints in the first round of samples."""
     depth_weight: float
     """Cost per metre of penetration."""
     move_weight: float = 1.0
-    """Cost of moving every joint by its first standard deviation."""
+    """Cost of moving every joint by its standard deviation in the first round."""
     population: int = 64
     """Samples per round."""
     patience: int = _ROUNDS
@@ -53,10 +53,10 @@ def free_by_search(
     away: Callable[[np.ndarray], float] = lambda qpos: 0.0,
     seed: int = 0,
 ) -> tuple[np.ndarray, bool]:
-    """Return the state near ``qpos`` with the least penetration, and whether that is negligible.
+    """Return the state of least penetration near ``qpos``, and whether its depth is negligible.
 
-    A cross-entropy search over offsets z of the hand's joint positions h, in units of the first
-    standard deviations s; coupled joints then follow their leaders:
+    A cross-entropy search finds offsets z of the hand's joint positions h, in units of the first
+    round's standard deviations s; coupled joints then follow their leaders:
 
         h(z) = clip(h_0 + s z)        cost(z) = away + depth_weight * depth + move_weight * |z|^2/n
 
@@ -129,7 +129,7 @@ def moved_out(table: Path, hand: Path, thing: Path, qpos: np.ndarray) -> np.ndar
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
         first, second = of_hand[data.contact.geom].T
-        total = 0.0  # contact order matters: stored starts depend on the last bit
+        total = 0.0  # summed in contact order: stored starts depend on the sum's last bit
         for dist in data.contact.dist[first != second].tolist():
             total += max(CLEARANCE_M - dist, 0.0)
         return total

@@ -1,4 +1,4 @@
-"""Joints that an equality constraint makes follow another joint, like `<mimic>` in URDF."""
+"""Joints that follow another joint by an equality constraint, like `<mimic>` in URDF."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Couplings:
 
     Args:
         model: its first joints are slides and hinges, with all positions 0 in ``qpos0``.
-        num_joints: number n of first joints; couplings whose follower comes later are ignored.
+        num_joints: number n of these joints; couplings whose follower comes later are ignored.
     """
 
     def __init__(self, model: mujoco.MjModel, num_joints: int) -> None:

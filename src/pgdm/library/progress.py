@@ -29,7 +29,7 @@ def silent(step: str, done: int, total: int) -> None:
 
 
 def counted(step: str, items: Collection[_Item], progress: StepProgress) -> Iterator[_Item]:
-    """Iterate over items, reporting before each how many are done, and at the end that all are."""
+    """Yield the items; report the number done before each item and after the last one."""
     for done, item in enumerate(items):
         progress(step, done, len(items))
         yield item

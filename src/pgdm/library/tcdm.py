@@ -31,7 +31,7 @@ class Tree:
     """Folders of a checkout."""
 
     root: Path
-    """Common parent; names in messages are relative to it."""
+    """Common parent of the two folders below; messages name files relative to it."""
     assets: Path
     """Folder that contains ``common.xml``, ``robots`` and ``objects``."""
     trajectories: Path
@@ -71,11 +71,11 @@ def import_tcdm(
         path: the checkout, its ``tcdm`` package or its assets folder.
         root: the library.
         progress: receives the steps: models, their compilation, and tasks.
-        replace: import even if tasks are lost that an earlier checkout provided.
+        replace: import even if that removes tasks that an earlier checkout provided.
 
     Raises:
         LibraryError: the folder is not a checkout, or has no table scene or no complete task; tasks
-            would be lost; or the library cannot be written.
+            would be removed, and ``replace`` is False; or the library cannot be written.
         CorruptAssetError: a file is damaged; the library remains unchanged.
     """
     tree = locate(path)
@@ -104,7 +104,7 @@ def _refuse_loss(root: Path, summary: ImportSummary, replace: bool) -> None:
         return  # an intact checkout may always replace a damaged source
     if lost:
         raise LibraryError(
-            f"{len(lost)} tasks now in the library are not in this folder ({', '.join(lost[:5])}"
+            f"tasks in the library that this folder lacks: {len(lost)} ({', '.join(lost[:5])}"
             f"{', ...' if len(lost) > 5 else ''}); import a complete checkout, or add --replace"
         )
 
@@ -185,7 +185,7 @@ def normalised(arrays: Mapping[str, Any], label: str) -> dict[str, np.ndarray]:
     data_substeps = float(motion_file.numbers(arrays, "DATA_SUBSTEPS", label, ()))
     if data_substeps != 1:
         raise CorruptAssetError(
-            f"{label}: DATA_SUBSTEPS is {data_substeps:g}; 1 pose per control step is supported"
+            f"{label}: DATA_SUBSTEPS is {data_substeps:g}; valid: 1 (one pose per control step)"
         )
     substeps = int(motion_file.numbers(arrays, "SIM_SUBSTEPS", label, ()))
     return motion_file.pack(rows[:steps], orientations[:steps], substeps, _starts(arrays, label))

@@ -17,10 +17,10 @@ HEIGHT_M = 0.005
 """Initial height of the object's lowest point above the table."""
 TIME_S = 4.0  # duration of the simulation
 SINK_M = 0.002
-"""An object at rest is less deep than this in the table; the contact margin is 0.5 mm."""
+"""An object at rest is sunk less than this into the table; the contact margin is 0.5 mm."""
 DRIFT_M = 0.03
 """An object at rest moves less than this horizontally in the second half of the simulation."""
-REST_M_S, REST_RAD_S = 0.01, 0.1  # an object at rest is slower at the end
+REST_M_S, REST_RAD_S = 0.01, 0.1  # an object at rest is slower than this at the end
 _TABLE = """<mujoco><option timestep="0.004" iterations="20" noslip_iterations="20"/>
 <default><geom friction="1 0.5 0.01" margin="0.0005"/></default>
 <worldbody><geom type="box" size="0.45 0.45 0.025" pos="0 0 -0.025"/></worldbody></mujoco>"""

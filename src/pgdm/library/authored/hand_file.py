@@ -29,7 +29,7 @@ MOST_JOINTS, MOST_BODIES = 60, 300
 _SECONDS = 60  # limit of CPU time for reading and compiling
 _DEFINITIONS = re.compile(rb"<!(DOCTYPE|ENTITY)", re.IGNORECASE)
 _REFUSED = ("extension", "plugin", "composite", "flexcomp", "skin", "replicate", "model", "attach")
-_SINGLE = ("revolute", "prismatic", "fixed")  # URDF joints
+_SINGLE = ("revolute", "prismatic", "fixed")  # accepted types of URDF joints
 _WORDS = re.compile(r"[+-]?(nan|inf|infinity)", re.IGNORECASE)
 # Dropped: a hand does not need these, and keyframes and sensors depend on joints that pgdm changes.
 _DROPPED = ("keyframe", "sensor", "statistic", "visual", "custom", "size", "option")
@@ -237,7 +237,7 @@ def _urdf(robot: ET.Element, path: Path, root: Path, notes: list[str]) -> list[P
         for texture in material.findall("texture"):
             material.remove(texture)
     if unseen:
-        notes.append(f"{unseen} visual meshes are neither STL, OBJ nor MSH and were left out")
+        notes.append(f"visual meshes left out, as they are neither STL, OBJ nor MSH: {unseen}")
     for mesh in robot.iter("mesh"):
         name = mesh.get("filename", "")
         if Path(name).suffix.lower() not in MESHES:
@@ -258,10 +258,10 @@ def _has_range(limit: ET.Element) -> bool:
 
 
 def _resolve_mimics(robot: ET.Element, label: str) -> None:
-    """Make each mimic joint follow a joint that mimics none.
+    """Make each mimic joint follow a joint that mimics no other.
 
-    If the joint is m times its leader plus o, and the leader m' times a joint q' plus o', the joint
-    is m (m' q' + o') + o.
+    If the joint's position is m q + o, where q = m' q' + o' is that of its leader, it is set to
+    follow q' as m (m' q' + o') + o.
     """
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
     for name, joint in joints.items():

@@ -25,7 +25,7 @@ MAX_FACES = 20_000
 200,000.)"""
 
 _THIN_M = 5e-4  # the models' contact margin; an object must be at least as thick
-# An open surface with a smaller share of its hull's volume is refused, unless a mass is given.
+# An open surface that encloses a smaller share of its hull is refused, unless a mass is given.
 _OPEN_SHARE = 0.5
 _MAX_BODIES = 50
 _LID_SHARE = 0.15  # holes are filled if the lids have at most this share of the surface's area
@@ -71,7 +71,8 @@ def read(path: Path, scale: float = 1.0, allow_open: bool = False) -> SoundMesh:
         ConfigError: the format is not supported, there is no such file, or the size is implausible
             in this unit; the message suggests a unit if one fits.
         CorruptAssetError: the file is unreadable or empty, has NaN or infinite vertices, is flat,
-            encloses almost no volume, has more than 50 pieces, or is open without ``allow_open``.
+            encloses almost no volume, has more than 50 pieces, or is far from closed without
+            ``allow_open``.
     """
     mesh = _load(path)
     repairs: list[str] = []

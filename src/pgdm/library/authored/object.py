@@ -50,7 +50,7 @@ class ObjectRequest:
     parts: PartsCfg = field(default_factory=PartsCfg)
     """How finely the mesh is decomposed into convex parts."""
     licence: str = "unstated"
-    """Licence of the mesh, its SPDX name if it has one."""
+    """Licence of the mesh, by its SPDX name if it has one."""
     replace: bool = False
     """Replace an object of the same name."""
 
@@ -89,7 +89,7 @@ class AuthoredObject:
             ("mass", f"{1e3 * self.body.mass_kg:.1f} g"),
             (
                 "convex parts",
-                f"{len(self.parts)}, total {whole / mesh.volume_m3:.2f} of the volume",
+                f"{len(self.parts)}, together {whole / mesh.volume_m3:.2f} of the mesh's volume",
             ),
             ("drop test", drop_text(self.drop)),
         ]
@@ -204,7 +204,7 @@ def _write(
     for title, shape in shapes.items():
         shape.apply_translation(-body.com)
         shape.export(raw / f"{title}.stl")
-        # Not a solid, because MuJoCo refuses the inertia of a thin or open surface.
+        # The visual mesh is a shell: MuJoCo would refuse a thin or open surface as a solid.
         kind = {"inertia": "shell"} if title == name else {}
         mjcf.add(section, "mesh", name=title, file=str(raw / f"{title}.stl"), **kind)
     mjcf.object_defaults(root)

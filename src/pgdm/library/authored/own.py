@@ -1,7 +1,8 @@
 """The library source ``own``: the user's objects, hands and motions.
 
-It is in the user's folder (:func:`pgdm.paths.user`), not in a cache, because it cannot be fetched
-again. Files are replaced atomically, then entered in the manifest; readers see only what it lists.
+The source is in the user's folder (:func:`pgdm.paths.user`), not in a cache, because it cannot be
+fetched again. Files are replaced atomically, then entered in the manifest; readers see only files
+that the manifest lists.
 """
 
 from __future__ import annotations
@@ -134,10 +135,10 @@ def add_model(
 
     Args:
         kind: ``objects`` or ``hands``.
-        name: its name.
+        name: the model's name.
         make: writes the model into the empty folder it is given; returns notes for the manifest.
-        origin: name of the file from which it was made.
-        licence: its licence.
+        origin: name of the file from which the model was made.
+        licence: the model's licence.
 
     Returns:
         The model's folder.
@@ -203,13 +204,13 @@ def check_unused(name: str) -> None:
     kind = kind_of(read(), name)
     if tasks := users_of(name):
         raise LibraryError(
-            f"{kind} '{name}' is used by {', '.join(tasks)}; remove "
+            f"tasks that use {kind} '{name}': {', '.join(tasks)}; remove "
             f"{'it' if len(tasks) == 1 else 'them'} first"
         )
 
 
 def remove(name: str) -> None:
-    """Remove the user's object, hand or task of this name, a task with its motion.
+    """Remove the user's object, hand or task of this name. A task's motion is removed with it.
 
     Raises:
         UnknownNameError: the user has nothing of that name; the message lists what exists.

@@ -29,7 +29,8 @@ class PartsCfg:
     """How a mesh is decomposed into convex parts."""
 
     threshold: float = 0.05
-    """Largest remaining concavity, relative to the size (0.01..1); lower values give more parts."""
+    """Largest concavity that may remain, relative to the mesh's size; valid: 0.01 to 1. Lower
+    values give more parts."""
     max_parts: int | None = None
     """Largest number of parts, 1 to 64; None: as many as the threshold requires."""
 

@@ -88,7 +88,10 @@ def compare(
 
 
 def compare_options(first: mujoco.MjModel, second: mujoco.MjModel) -> list[Difference]:
-    """List the physics options that differ; those of the scene apply, not an attached model's."""
+    """List the physics options that differ.
+
+    Compare scenes: the options of models attached to a scene have no effect.
+    """
     found = _Comparison(first, second, TOLERANCE)
     for name in _OPTIONS.split():
         found.value("option", name, getattr(first.opt, name), getattr(second.opt, name))

@@ -46,11 +46,11 @@ def counts(path: Path, label: str) -> tuple[int, int]:
 def compiled(
     path: Path, label: str, edit: Callable[[mujoco.MjSpec], object] | None = None
 ) -> mujoco.MjModel:
-    """Compile a library model with :func:`compile_tracked`, whose tracked body is ``object``.
+    """Compile a library model with :func:`compile_tracked`; the tracked body is ``object``.
 
     Args:
-        path: its MJCF file.
-        label: its name in messages.
+        path: the model's MJCF file.
+        label: the model's name in messages.
         edit: changes the spec before it is compiled.
 
     Raises:

@@ -70,8 +70,8 @@ def explain_expert(library: Library, task: str) -> Iterator[str]:
     yield f"  poses: {entry.steps}, after {entry.skipped} skipped frames of the recording"
     moved = ", ".join(f"{1e3 * x:.1f}" for x in entry.shift_m)
     yield (
-        f"  its object deviates from the motion's by {1e3 * entry.object_mean_m:.3f} mm (mean), "
-        f"{1e3 * entry.object_max_m:.3f} mm (max)"
+        "  the recording's object deviates from the motion's by "
+        f"{1e3 * entry.object_mean_m:.3f} mm (mean), {1e3 * entry.object_max_m:.3f} mm (max)"
         + (f", after a shift by ({moved}) mm" if any(entry.shift_m) else "")
     )
     yield (
@@ -87,7 +87,7 @@ def explain_expert(library: Library, task: str) -> Iterator[str]:
 
 
 def needed(library: Library, task: str, source: str) -> list[str]:
-    """Return a source's models and motion of a task, relative to the source's folder; no meshes."""
+    """Return a source's files of a task, relative to its folder: models (no meshes) and motion."""
     entry = library.entry(task, source)
     every = [
         "scene/table.xml",

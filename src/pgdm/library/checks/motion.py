@@ -50,8 +50,8 @@ def check_motion(poses: Poses, label: str) -> None:
     """Check length, jumps, speeds, accelerations, and that the object starts at rest.
 
     Raises:
-        ConfigError: a check fails; the message names the row and the option that helps, if there
-            are any.
+        ConfigError: a check fails; where possible, the message names the row and an option that
+            helps.
     """
     steps = len(poses.pos)
     if not STEPS[0] <= steps <= STEPS[1]:
@@ -96,7 +96,7 @@ def _around(values: np.ndarray, row: int) -> float:
 
 
 def smoothed(poses: Poses) -> Poses:
-    """Return the motion low-pass filtered, with 8 poses added at each end so that both rest."""
+    """Return the motion low-pass filtered, with 8 poses added at each end so that the ends rest."""
     rows = np.concatenate((poses.pos, continuous(poses.quat)), axis=1)
     padded = np.pad(rows, ((_EASE_STEPS, _EASE_STEPS), (0, 0)), mode="edge")
     filtered = gaussian_filter1d(padded, _SMOOTH_STEPS, axis=0, mode="nearest")
@@ -149,8 +149,8 @@ class TableCheck:
         if depths[row] > SUNK_M:
             raise ConfigError(
                 f"{label}: the object's lowest point is {1e3 * depths[row]:.0f} mm below the table "
-                f"in row {row} ({(depths > SUNK_M).sum()} such rows); --lift-above-table raises "
-                "them"
+                f"in row {row} (rows that are too low: {(depths > SUNK_M).sum()}); "
+                "--lift-above-table raises them"
             )
 
     def lifted(self, poses: Poses) -> Poses:

@@ -12,7 +12,7 @@ def damaged(library: Library, progress: StepProgress = silent) -> list[str]:
 
     Args:
         library: the library.
-        progress: receives the number of files.
+        progress: receives the number of files checked.
 
     Returns:
         A line per damaged file; empty if all files are intact.

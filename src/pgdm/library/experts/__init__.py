@@ -1,1 +1,1 @@
-"""Expert hand trajectories: rebuilding unpublished ones, measuring, and filling the library."""
+"""Expert hand trajectories: rebuilding unpublished ones, measuring all, filling the library."""

