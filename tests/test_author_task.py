@@ -166,7 +166,7 @@ def test_poses_in_the_table_are_refused_or_raised(recorded: Path) -> None:
         (
             {"pregrasp": "cup-pour1"},
             ConfigError,
-            "is for hand 'adroit', this task's hand is 'dmanus'",
+            "is a task of hand 'adroit'; give one .* of hand 'dmanus'",
         ),
     ],
 )

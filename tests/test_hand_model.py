@@ -72,7 +72,7 @@ BROKEN = {
     "held": (
         "<equality>",
         '<equality><joint joint1="h/f0"/>',
-        "an equality constraint holds 'h/f0'",
+        "an equality constraint acts on 'h/f0'",
     ),
     "base coupled": (
         "<equality>",
@@ -102,12 +102,12 @@ BROKEN = {
     "closed loop": (
         "<equality>",
         '<equality><weld body1="object" body2="h/tip"/>',
-        "an equality constraint holds 'h/tip'",
+        "an equality constraint acts on 'h/tip'",
     ),
     "coupled tendon": (
         "<equality>",
         '<equality><tendon tendon1="h/both"/>',
-        "an equality constraint holds 'h/both'",
+        "an equality constraint acts on 'h/both'",
     ),
     "free base": (JOINTS, '<freejoint name="h/free"/>', "joint 'h/free' is a free joint"),
     "ball object": ('type="slide" axis="0 0 1"/></body>', 'type="ball"/></body>', "a ball joint"),
@@ -148,9 +148,9 @@ def test_what_the_settings_say_must_be_in_the_model() -> None:
     assert actuators(XML) == list(range(8))
     with pytest.raises(SceneError, match=r"hand.num_base_joints is 3; it must be 6"):
         actuators(XML, replace(HAND, num_base_joints=3))
-    with pytest.raises(SceneError, match=r"there are 8 joints 'h/...', less than"):
+    with pytest.raises(SceneError, match=r"there are 8 joints 'h/...', fewer than"):
         actuators(XML, replace(HAND, num_wrist_joints=3))
-    with pytest.raises(SceneError, match=r"there are 0 joints 'k/...', less than .*hand's name"):
+    with pytest.raises(SceneError, match=r"there are 0 joints 'k/...', fewer than .*must be 'k'"):
         actuators(XML, replace(HAND, name="k"))
     with pytest.raises(SceneError, match=r"must be a slide .* mount body 'h/finger'"):
         actuators(XML, replace(HAND, mount_body="finger"))

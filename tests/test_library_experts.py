@@ -304,7 +304,9 @@ def test_one_that_does_not_fit_the_motion_is_refused(root: Path) -> None:
 @pytest.mark.parametrize("text", ["{", '{"format": 99}', "[]", '{"format": 1, "experts": {}}'])
 def test_the_error_for_a_damaged_index_names_the_command_that_helps(root: Path, text: str) -> None:
     (root / "experts" / "manifest.json").write_text(text)
-    with pytest.raises(CorruptAssetError, match=r"experts/manifest\.json.*'pgdm assets fetch'"):
+    with pytest.raises(
+        CorruptAssetError, match=r"experts/manifest\.json.*'pgdm assets fetch --experts'"
+    ):
         open_library(root).experts()
 
 

@@ -177,5 +177,5 @@ def test_planned_commands_are_sent_unchanged_and_corrected() -> None:
 
 def test_a_planned_wrist_without_commands_is_an_error() -> None:
     ref = reference([[0.0, 0, 0], [0.1, 0, 0]])
-    with pytest.raises(ConfigError, match="commands of a plan"):
+    with pytest.raises(ConfigError, match="base commands of a wrist plan"):
         action_map(PLANNED, tiny_index(), ref, ZERO)

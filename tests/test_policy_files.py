@@ -80,7 +80,7 @@ BAD = {
     "no JSON": (save({"w": torch.zeros(1)}, {"pgdm": "{"}), "holds no policy of pgdm"),
     "a newer format": (packed(format="pgdm-policy-9"), "has format 'pgdm-policy-9'"),
     "a number as network": (packed(network=3), "'network' is 3"),
-    "huge sizes": (packed(network={**vars(SIZES), "obs_dim": 10**12}), "holds no policy of this"),
+    "huge sizes": (packed(network={**vars(SIZES), "obs_dim": 10**12}), "no policy that this"),
     "NaN": (altered(with_nan), "has values that are not finite"),
     "a negative variance": (altered(with_negative_variance), "has negative values"),
     "other weights": (other_weights(), "do not match their SHA-256"),

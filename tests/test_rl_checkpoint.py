@@ -117,7 +117,7 @@ def test_a_damaged_newest_is_skipped_with_a_warning(
         assert folder.latest() == {"frames": 1}
     assert len(caplog.records) == 2
     assert "frames_000000000003.ckpt" in caplog.text
-    assert "the one before" in caplog.text
+    assert "the checkpoint before it" in caplog.text
 
 
 def test_a_damaged_newest_does_not_displace_good_ones(tmp_path: Path) -> None:

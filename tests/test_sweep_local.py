@@ -114,7 +114,10 @@ def test_a_signal_saves_and_the_same_command_goes_on(folder: Path, number: signa
         log = log_path(folder, f"seed={seed}", 2).read_text()
         assert f"at {stopped[seed]:,} frames" in log
     (folder / "launch.json").unlink()
-    assert "by its own command: pgdm-run -m" in command("pgdm", "sweep", "resume", str(folder)).err
+    assert (
+        "with its original command: pgdm-run -m"
+        in command("pgdm", "sweep", "resume", str(folder)).err
+    )
 
 
 @pytest.mark.slow

@@ -105,7 +105,7 @@ def as_name(text: str) -> str:
 
 
 def inside(folder: Path, *names: str, kind: str = "name", suffix: str = "") -> Path:
-    """Join names to a folder after checking them: the way to turn any user's name into a path.
+    """Check names, then join them to a folder. Any name that a user chose becomes a path here.
 
     Args:
         folder: the folder.

@@ -36,7 +36,7 @@ class Playback:
     time_s: np.ndarray = field(repr=False)  # (K,) increasing from 0
     arm_joints_rad: np.ndarray = field(repr=False)  # (K, 7) commanded
     hand_joints_rad: np.ndarray = field(repr=False)  # (K, h) commanded
-    base_pos_m: np.ndarray = field(repr=False)  # (K, 3) of the hand's mount body, commanded
+    base_pos_m: np.ndarray = field(repr=False)  # (K, 3) hand's mount body, as to follow
     base_quat: np.ndarray = field(repr=False)  # (K, 4)
     object_pos_m: np.ndarray = field(repr=False)  # (K, 3) centre of mass, expected
     object_quat: np.ndarray = field(repr=False)  # (K, 4)
@@ -45,7 +45,8 @@ class Playback:
     hand_joints: tuple[str, ...]
     """Names of the hand's joints, (h,), without the six base joints."""
     facts: dict[str, Any]
-    """Origin of the playback, and poses of arm, hand and table; plain values."""
+    """Where the playback comes from (task, run, settings), and where arm, hand and table are: plain
+    values."""
 
     @property
     def duration_s(self) -> float:

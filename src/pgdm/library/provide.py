@@ -1,4 +1,4 @@
-"""Opening the library for a task, after fetching what is missing from the package index."""
+"""Opens the library for a task; what it lacks is first fetched from the package index."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class _Scale:
     high: float
 
     def __call__(self, frames: Array, values: Array) -> Array:
-        """Return points in the unit square, (N, 2); values that are not finite are left out."""
+        """Return points in or just outside the unit square, (N, 2), without non-finite values."""
         y = np.log10(values.clip(10.0**self.low)) if self.logarithmic else values
         places = np.column_stack([frames / self.furthest, (y - self.low) / (self.high - self.low)])
         return places[np.isfinite(places).all(axis=1)].clip(-0.02, 1.02)

@@ -14,7 +14,7 @@ from pgdm.runs.result import WRIST_BOUND
 
 @dataclass(frozen=True)
 class TaskRow:
-    """A setting on a task; means over the finished seeds."""
+    """A configuration of runs (`Setting`) on a task; metrics are means over the finished seeds."""
 
     setting: Setting
     task: str

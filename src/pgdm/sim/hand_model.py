@@ -126,8 +126,8 @@ def _check_joints(model: mujoco.MjModel, hand: HandCfg) -> int:
         raise _wrong(
             hand,
             f"there are {count} joints '{prefix}...', fewer than hand.num_base_joints "
-            f"{hand.num_base_joints} plus hand.num_wrist_joints {hand.num_wrist_joints}; the model "
-            "must have the hand's name",
+            f"{hand.num_base_joints} plus hand.num_wrist_joints {hand.num_wrist_joints}; the "
+            f"prefix is the model's name (<mujoco model=...>), which must be '{hand.name}'",
         )
     return count
 
@@ -141,7 +141,7 @@ def _check_base(model: mujoco.MjModel, hand: HandCfg) -> None:
         if not _fits(model, joint, joint) or body.name != mount or body.parentid[0]:
             raise _wrong(
                 hand,
-                f"its joint number {joint} is '{_joint(model, joint)}'; that joint must be a "
+                f"joint number {joint + 1} is '{_joint(model, joint)}'; that joint must be a "
                 f"{wanted} at the origin of the mount body '{mount}', a child of the world",
             )
 
@@ -160,8 +160,8 @@ def _check_couplings(model: mujoco.MjModel, hand: HandCfg, count: int) -> np.nda
             if (name or "").startswith(f"{hand.name}/") and number not in couplings.rows:
                 raise _wrong(
                     hand,
-                    f"an equality constraint holds '{name}'; only a joint that follows another "
-                    "joint of the hand is supported: remove the constraint, or the joint",
+                    f"an equality constraint acts on '{name}'; the only supported kind makes one "
+                    "joint of the hand follow another: remove the constraint",
                 )
     coupled[couplings.followers] = True
     for row, follower, leader in zip(

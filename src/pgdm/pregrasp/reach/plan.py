@@ -28,13 +28,14 @@ contacts are soft."""
 class ReachPlan:
     """A reach plan and where it ends.
 
-    The target is the pre-grasp. It is clipped to the hand's ranges before errors are measured.
+    The target is the pre-grasp as given. The errors of the joints are measured against a copy of it
+    that is clipped to the hand's ranges.
     """
 
     actions: np.ndarray = field(repr=False)
     """(K, nu) in [-1, 1]."""
     state: Start = field(repr=False)
-    """State in which the plan ends in simulation, with the plan's actions."""
+    """State in which the plan ends in simulation; its ``actions`` are the plan's."""
     base_error_m: float
     """Largest error of a slide of the base."""
     base_error_rad: float
@@ -42,10 +43,9 @@ class ReachPlan:
     finger_error_rad: float
     """Largest error of a joint after the base."""
     object_moved_m: float
-    """Distance of the object's centre of mass from its place if the hand had stayed away."""
+    """Distance of the object's centre of mass from where it would be without the hand."""
     object_turned_rad: float
-    """Angle between the object's orientation and the one it would have if the hand had stayed
-    away."""
+    """Angle between the object's orientation and the one it would have without the hand."""
     depth_m: float
     """Deepest penetration between the hand and anything else at the end of the plan."""
     target_depth_m: float
