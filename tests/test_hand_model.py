@@ -118,10 +118,18 @@ BROKEN = {
     ),
     "unlimited": ('"h/f1" range="-1 1"', '"h/f1"', "joint 'h/f1' has no range"),
     "ref": ('"h/f1" range', '"h/f1" ref=".3" range', "joint 'h/f1' has ref 0.3"),
-    "base short": (JOINTS.splitlines()[5], "", "'h/f0' is number 5 .* must be a hinge about z"),
-    "base order": ('axis="1 0 0"', 'axis="0 1 0"', f"'h/b0' is number 0 .* must be a {BASE[0]}"),
-    "base kind": ('"h/b3" type="hinge"', '"h/b3" type="slide"', "'h/b3' is number 3"),
-    "base away": ('"h/b4" type', '"h/b4" pos="0 0 1" type', "'h/b4' is number 4"),
+    "base short": (
+        JOINTS.splitlines()[5],
+        "",
+        "joint number 6 is 'h/f0'; .* must be a hinge about z",
+    ),
+    "base order": (
+        'axis="1 0 0"',
+        'axis="0 1 0"',
+        f"joint number 1 is 'h/b0'; .* must be a {BASE[0]}",
+    ),
+    "base kind": ('"h/b3" type="hinge"', '"h/b3" type="slide"', "joint number 4 is 'h/b3'"),
+    "base away": ('"h/b4" type', '"h/b4" pos="0 0 1" type', "joint number 5 is 'h/b4'"),
 }
 
 
