@@ -200,7 +200,7 @@ def test_an_arm_that_rests_carries_the_hand(panda: Path, scene: Scene) -> None:
     assert not outcome.diverged.any() and not outcome.held.any()
     assert np.degrees(outcome.arm_error_rad.max()) < 0.5
     assert np.abs(outcome.height_m).max() < 0.02
-    with pytest.raises(PlaybackError, match="start_qpos is not a list of 22 numbers"):
+    with pytest.raises(PlaybackError, match="start_qpos is not a list of 22 finite numbers"):
         start_of(replace(playback, facts={"start_qpos": [1.0, None]}), on_arm, 16)
     with pytest.raises(PlaybackError, match="hand_joints are a, b"):
         start_of(replace(playback, hand_joints=("a", "b")), on_arm, 16)
