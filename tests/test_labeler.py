@@ -216,7 +216,7 @@ def test_presets() -> None:
     poses, scene = poses_of(TASK), built(TASK).scene
     assert poses.available() == ["mined", "planned", "mean", "open", "none"]
     mined = poses.load("mined")
-    assert mined.notes and "adroit/LFJ3 the most by 0.138" in mined.notes[0]
+    assert mined.notes and "adroit/LFJ3 the most, by 0.138" in mined.notes[0]
     low, high = scene.model.jnt_range[:30].T
     assert ((mined.qpos[:30] >= low) & (mined.qpos[:30] <= high)).all()
     np.testing.assert_array_equal(poses.load("open").qpos[8:30], np.zeros(22))
@@ -262,7 +262,7 @@ def test_bad_files_are_refused_or_repaired(tmp_path: Path) -> None:
     repaired = poses.load(str(written("far.npz", far, task="cup-pour1")))
     assert repaired.qpos[0] == 0.25
     assert repaired.notes[0] == "far.npz is for task cup-pour1"
-    assert "adroit/ARTx the most by 2.750" in repaired.notes[1]
+    assert "adroit/ARTx the most, by 2.750" in repaired.notes[1]
     (tmp_path / "text.npz").write_text("no pre-grasp")
     with pytest.raises(CorruptAssetError, match=r"text\.npz"):
         poses.load(str(tmp_path / "text.npz"))

@@ -145,7 +145,7 @@ class Poses:
         if beyond.max() > 1e-3:  # smaller excesses are rounding errors of the released files
             worst = self._scene.model.joint(int(beyond.argmax())).name
             notes += (
-                f"joints of the {origin} that exceeded their limits and were clipped: "
+                f"{origin}: joints that exceeded their limits and were clipped: "
                 f"{int((beyond > 1e-3).sum())}, {worst} the most, by {beyond.max():.3f} m or rad",
             )
         return Loaded(np.concatenate((inside, self._base[self._n :])), origin, notes)
