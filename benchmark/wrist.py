@@ -27,7 +27,7 @@ from pgdm.envs.build import EnvBuilder
 from pgdm.experiment import assets, env_builder
 from pgdm.motion.reference import ObjectReference
 from pgdm.rl.evaluate import run_episodes
-from pgdm.rl.networks import SquashedCfg, SquashedPolicy
+from pgdm.rl.sac import SACLearner
 from pgdm.runs.files import read_json, write_json
 from pgdm.seeding import torch_stream
 from pgdm.sim.scene import SceneIndex
@@ -68,15 +68,7 @@ def untrained(cfg: ExperimentCfg) -> float:
     """Return the mean return of 25 episodes of the untrained policy of `algo=sac`, seed 0."""
     builder, sac = env_builder(cfg, assets(cfg, print), print), compose(["algo=sac"]).algo
     evaluation = builder.make(25, stream="eval_sampled")
-    network = SquashedCfg(
-        kind="squashed",
-        obs_dim=evaluation.obs_dim,
-        action_dim=evaluation.action_dim,
-        hidden=list(sac.hidden),
-        log_std_init=sac.log_std_init,
-        observation_clip=sac.observation_clip,
-    )
-    policy = SquashedPolicy(network, torch_stream(0, "weights"), evaluation.warm_start())
+    policy = SACLearner(evaluation, sac, 0, 1, None, "cpu", 1).model
     results = run_episodes(evaluation, policy, torch_stream(0, "eval"))
     assert results is not None
     return round(float(results["return"].mean()), 1)
