@@ -27,7 +27,7 @@ from pgdm.envs.build import EnvBuilder
 from pgdm.experiment import assets, env_builder
 from pgdm.motion.reference import ObjectReference
 from pgdm.rl.evaluate import run_episodes
-from pgdm.rl.sac import SACLearner
+from pgdm.rl.sac import SACCfg, SACLearner
 from pgdm.runs.files import read_json, write_json
 from pgdm.seeding import torch_stream
 from pgdm.sim.scene import SceneIndex
@@ -67,6 +67,7 @@ def measure(task: str) -> dict[str, Any]:
 def untrained(cfg: ExperimentCfg) -> float:
     """Return the mean return of 25 episodes of the untrained policy of `algo=sac`, seed 0."""
     builder, sac = env_builder(cfg, assets(cfg, print), print), compose(["algo=sac"]).algo
+    assert isinstance(sac, SACCfg)
     evaluation = builder.make(25, stream="eval_sampled")
     policy = SACLearner(evaluation, sac, 0, 1, None, "cpu", 1).model
     results = run_episodes(evaluation, policy, torch_stream(0, "eval"))
