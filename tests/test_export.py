@@ -27,7 +27,7 @@ from pgdm.library.progress import silent
 SCRIPT = Path(__file__).resolve().parents[1] / "docs" / "run_policy.py"
 LEARNERS = {
     "ppo": TINY,
-    "ppo_fast": (*TINY, "algo=ppo_fast", "action=residual"),
+    "ppo_fast": (*TINY, "algo=ppo_fast", "action=residual", "action.residual_power=2"),
     "sac": ("+experiment=fast", *TINY_SAC),  # its wrist is planned
 }
 
@@ -182,7 +182,8 @@ def test_the_description_names_every_number(exported: Exported) -> None:
     by_hand = np.array(action["middle"]) + np.array(action["half"]) * np.clip(a, -1, 1)
     if (wrist := action["wrist"]) is not None:
         ahead = wrist["path"][min(3 + wrist["lead_steps"], len(wrist["path"]) - 1)]
-        base = np.array(ahead) + np.array(wrist["largest"]) * np.clip(a[:6], -1, 1)
+        share = np.sign(a[:6]) * np.abs(np.clip(a[:6], -1, 1)) ** wrist["power"]
+        base = np.array(ahead) + np.array(wrist["largest"]) * share
         by_hand[:6] = np.clip(base, wrist["low"], wrist["high"])
     names = dict(zip(action["joints"], by_hand, strict=True))
     model = exported.builder.scene.model

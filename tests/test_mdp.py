@@ -19,7 +19,7 @@ from pgdm.sim.batch import SimState
 from tiny_scene import IDENTITY, QUARTER_Z, double, reference, tiny_index
 
 CFG = MetricsCfg(success_threshold_m=0.01, lift_height_m=0.02)
-ABSOLUTE = ActionCfg("absolute", 3, 0.25, "carried", 0, False)
+ABSOLUTE = ActionCfg("absolute", 3, 0.25, 1.0, "carried", 0, False)
 RESIDUAL = replace(ABSOLUTE, kind="residual")
 PLANNED = replace(RESIDUAL, wrist_path="planned")
 ZERO = torch.zeros(8).double()
@@ -163,6 +163,14 @@ def test_residual_leads_by_three_steps_and_corrects_by_a_quarter() -> None:
     assert ctrl[0, 0].item() == pytest.approx(0.05 + 0.25)
     assert ctrl[1, 0].item() == pytest.approx(0.09)  # beyond the motion: its last pose
     assert amap.warm_start[:6].abs().max() == 0.0
+
+
+def test_a_power_makes_small_corrections_smaller() -> None:
+    cfg = replace(RESIDUAL, residual_power=2.0)
+    amap = action_map(cfg, tiny_index(), reference([[0.0, 0, 0]] * 4), ZERO)
+    ctrl = amap.act(torch.tensor([[-0.5] + [0.0] * 7, [1.0] + [0.0] * 7]), torch.tensor([0, 0]))
+    # A quarter of the half-range 1, times -0.5^2 and 1^2.
+    assert ctrl[:, 0].tolist() == pytest.approx([-0.25 * 0.25, 0.25])
 
 
 def test_planned_commands_are_sent_unchanged_and_corrected() -> None:

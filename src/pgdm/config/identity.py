@@ -45,6 +45,7 @@ ADDED_LATER: dict[str, Any] = {
     "action.wrist_path": "carried",
     "action.hold_steps": 0,
     "action.carry_load": False,
+    "action.residual_power": 1.0,
     "algo.learner": "ppo",
     "keep_replay": False,
     "shaping.name": "none",

@@ -18,6 +18,7 @@ _AT_LEAST: dict[str, int] = {
     "action.lead_steps": 0,
     "action.hold_steps": 0,
     "action.residual_scale": 0,
+    "action.residual_power": 1,
     "algo.value_coef": 0,
     "algo.entropy_coef": 0,
     "algo.steps_per_env": 1,

@@ -41,7 +41,8 @@ def description(policy: TrainedPolicy, builder: EnvBuilder) -> dict[str, Any]:
     - ``action``: for the hand's driven ``joints``, first clipped to [-1, 1]; then
       ``target = middle + half * action`` (m, rad). If there is a ``wrist``, the targets of the
       first ``len(low)`` joints are instead
-      ``clip(path[min(t + lead_steps, T-1)] + largest * action, low, high)``;
+      ``clip(path[min(t + lead_steps, T-1)] + largest * sign(action) * abs(action) ** power, low,
+      high)``;
     - ``actuators``: names, in the order of MuJoCo's ``ctrl``;
     - ``control``: ``timestep_s`` of a physics step, and ``substeps`` per control step. At the start
       of a control step, copy the first ``compensated_joints`` entries of ``qfrc_bias`` to
@@ -147,6 +148,7 @@ def _action(builder: EnvBuilder, joints: list[str]) -> dict[str, Any]:
             "path": wrist.path.tolist(),
             "lead_steps": wrist.lead_steps,
             "largest": wrist.largest.tolist(),
+            "power": wrist.power,
             "low": wrist.low.tolist(),
             "high": wrist.high.tolist(),
         }

@@ -32,6 +32,9 @@ class ActionCfg:
     offset servo lag."""
     residual_scale: float
     """Residual: largest correction as a fraction of the half-range of each base joint (0..1)."""
+    residual_power: float
+    """Residual: power of the action's magnitude to which the correction is proportional; 1: the
+    correction is linear, 2: small actions correct little, an action of 1 as much as before."""
     wrist_path: str
     """Residual: ``planned`` (see `pgdm.wrist.plan`), ``carried``, ``clipped`` or ``feasible`` (see
     `pgdm.wrist.path`)."""
@@ -56,12 +59,15 @@ class WristPrior:
     path: Tensor  # (T, b)
     lead_steps: int
     largest: Tensor  # (b,) correction at an action of 1
+    power: float
     low: Tensor  # (b,) control range
     high: Tensor  # (b,)
 
     def targets(self, action: Tensor, t: Tensor) -> Tensor:
         """Return targets (n, b) for the base's part of an action, (n, b), at steps t (n,)."""
         ahead = self.path[(t + self.lead_steps).clamp(max=len(self.path) - 1)]
+        if self.power != 1:
+            action = action.sign() * action.abs() ** self.power
         return torch.clamp(ahead + self.largest * action, self.low, self.high)
 
 
@@ -138,7 +144,8 @@ def _residual(
     largest = cfg.residual_scale * 0.5 * (high - low)
     warm = base.warm_start.clone()
     warm[:n] = 0.0
-    return replace(base, warm_start=warm, wrist=WristPrior(path, lead, largest, low, high))
+    prior = WristPrior(path, lead, largest, cfg.residual_power, low, high)
+    return replace(base, warm_start=warm, wrist=prior)
 
 
 def action_map(
@@ -155,8 +162,8 @@ def action_map(
     positions, plus 0.2 on entry 1 and on every entry from 6 on, clipped to [-1, 1].
 
     Residual (pgdm's own): the same for the fingers; with the wrist path b, the base joints are
-    commanded to b(min(t + lead_steps, T-1)) + residual_scale * half * a, clipped to their ranges.
-    The commands of a wrist plan have no lead. The warm start is 0 for the base.
+    commanded to b(min(t + lead_steps, T-1)) + residual_scale * half * sign(a) |a|^residual_power,
+    clipped to their ranges. The commands of a wrist plan have no lead. The warm start is 0 for the base.
 
     Args:
         cfg: settings of the action.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -128,7 +128,9 @@ def feasible_path(index: SceneIndex, reference: ObjectReference, start: Tensor) 
 
         found = min(
             (
-                least_squares(residual, begin.clip(low[3:], high[3:]), bounds=(low[3:], high[3:]))
+                scipy.optimize.least_squares(
+                    residual, begin.clip(low[3:], high[3:]), bounds=(low[3:], high[3:])
+                )
                 for begin in (before, wanted)
             ),
             key=lambda result: result.cost,
