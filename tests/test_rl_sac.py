@@ -86,6 +86,20 @@ def test_the_same_seed_repeats_to_the_bit_whatever_the_global_stream() -> None:
     assert first[1] != other[1]
 
 
+def test_the_exploration_noise_is_standard_normal_and_correlated_over_steps() -> None:
+    torch.manual_seed(0)
+    learner = build(PointEnv(2000), replace(SHORT, noise_correlation=0.9))
+    obs = torch.zeros(2000, D)
+    with torch.no_grad():
+        mean, std = learner.model(learner.model.normalizer(obs))
+    actions = torch.stack([learner.explore(obs)[0] for _ in range(8)])
+    noise = ((actions.double().atanh() - mean) / std).flatten(1)  # (8, 4000)
+    assert noise.mean(1).abs().max() < 0.06
+    assert (noise.std(1) - 1).abs().max() < 0.05
+    lag = [float((noise[0] * noise[k]).mean()) for k in (1, 5)]
+    assert lag == pytest.approx([0.9, 0.9**5], abs=0.05)
+
+
 @pytest.mark.parametrize("bfloat16", [False, True])
 def test_updates_during_the_physics_change_no_bit(
     bfloat16: bool, monkeypatch: pytest.MonkeyPatch

@@ -47,6 +47,7 @@ ADDED_LATER: dict[str, Any] = {
     "action.carry_load": False,
     "action.residual_power": 1.0,
     "algo.learner": "ppo",
+    "algo.noise_correlation": 0.0,
     "keep_replay": False,
     "shaping.name": "none",
     "shaping.kernel_weight": 0.0,
@@ -56,6 +57,8 @@ ADDED_LATER: dict[str, Any] = {
     "sim.object_mass": "volume",
     "time_limit_min": None,
 }
+
+_ONLY_SAC = ("algo.noise_correlation",)  # PPO has no such key
 
 # Keys that have an effect only if the wrist is planned.
 _ONLY_PLANNED = ("action.hold_steps", "action.carry_load")
@@ -68,7 +71,9 @@ def with_added_keys(plain: Mapping[str, Any]) -> dict[str, Any]:
         group, _, name = key.rpartition(".")
         if not group:
             result.setdefault(name, value)
-        elif isinstance(inner := result.get(group, {}), Mapping):
+        elif isinstance(inner := result.get(group, {}), Mapping) and (
+            key not in _ONLY_SAC or inner.get("learner") == "sac"
+        ):
             result[group] = {name: value} | dict(inner)
     return result
 

@@ -163,7 +163,8 @@ def action_map(
 
     Residual (pgdm's own): the same for the fingers; with the wrist path b, the base joints are
     commanded to b(min(t + lead_steps, T-1)) + residual_scale * half * sign(a) |a|^residual_power,
-    clipped to their ranges. The commands of a wrist plan have no lead. The warm start is 0 for the base.
+    clipped to their ranges. The commands of a wrist plan have no lead. The warm start is 0 for the
+    base.
 
     Args:
         cfg: settings of the action.

@@ -102,6 +102,10 @@ class Learner(Protocol):
         """Whether ``during_step`` may run in parallel with the physics."""
         ...
 
+    def explore(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw training actions (N, A) at raw observations (N, D); return them and the means."""
+        ...
+
     def during_step(self) -> None:
         """Learn while the simulations take a step, from earlier steps only.
 

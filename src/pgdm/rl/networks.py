@@ -206,11 +206,17 @@ class SquashedPolicy(nn.Module):
         return torch.tanh(self(self.normalizer(obs))[0])
 
     @torch.no_grad()
-    def sample(self, obs: Tensor, generator: Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Draw actions (N, A); return them and the squashed means, see `ActorCritic.sample`."""
+    def sample(
+        self, obs: Tensor, generator: Generator | None = None, noise: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Draw actions (N, A); return them and the squashed means, see `ActorCritic.sample`.
+
+        ``noise`` (N, A), standard normal, is used instead of drawing it.
+        """
         mean, std = self(self.normalizer(obs.to(self.device)))
-        noise = torch.randn(mean.shape, generator=generator).to(self.device)
-        return torch.tanh(mean + std * noise), torch.tanh(mean)
+        if noise is None:
+            noise = torch.randn(mean.shape, generator=generator)
+        return torch.tanh(mean + std * noise.to(self.device)), torch.tanh(mean)
 
     @torch.no_grad()
     def act(

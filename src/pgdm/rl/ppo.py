@@ -105,6 +105,10 @@ class PPOLearner:
 
     overlaps = False
 
+    def explore(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw training actions (N, A) at raw observations (N, D); return them and the means."""
+        return self.model.sample(obs)
+
     def during_step(self) -> None:
         """Do nothing: PPO learns between rollouts."""
 

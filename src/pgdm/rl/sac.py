@@ -54,6 +54,8 @@ class SACCfg(AlgoCfg):
     ``total_frames``, so that extending a run does not alter the change."""
     temperature_init: float
     """Weight of the entropy in the return at the start."""
+    noise_correlation: float
+    """Correlation of the exploration noise between consecutive control steps, 0..1; 0: none."""
     warmup_steps: int
     """Control steps of all simulations before the first update."""
     bfloat16: bool
@@ -159,8 +161,27 @@ class SACLearner:
             replay_folder,
             None if env.device.type == "cpu" else env.device,
         )
+        self._noise: Tensor | None = None
         self._updates = 0
         self._logged: list[dict[str, Tensor]] = []
+
+    def explore(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw training actions (N, A) at raw observations (N, D); return them and the means.
+
+        The noise e before tanh is standard normal at every step; between consecutive steps of a
+        simulation it has the correlation rho of ``noise_correlation``,
+        e' = rho e + sqrt(1 - rho^2) n with n standard normal. Servos filter out noise that changes
+        at every step (Eberhard et al. 2023 use pink noise for the same reason).
+        """
+        rho = self.cfg.noise_correlation
+        if not rho:
+            return self.model.sample(obs)
+        fresh = torch.randn(len(obs), self._env.action_dim)
+        if self._noise is None:
+            self._noise = fresh
+        else:
+            self._noise = rho * self._noise + math.sqrt(1 - rho * rho) * fresh
+        return self.model.sample(obs, noise=self._noise)
 
     def during_step(self) -> None:
         """Make the updates of one control step; none during the first ``warmup_steps``.
@@ -219,6 +240,7 @@ class SACLearner:
             "loss": {name: value.clone() for name, value in self._loss.state_dict().items()},
             "optimizers": {name: o.state_dict() for name, o in self._optimizers.items()},
             "streams": [g.get_state() for g in (self._actions, self._samples)],
+            "noise": self._noise,
             "updates": self._updates,
             "replay": self._replay.state_dict(),
         }
@@ -236,6 +258,7 @@ class SACLearner:
             optimizer.load_state_dict(state["optimizers"][name])
         for stream, stored in zip((self._actions, self._samples), state["streams"], strict=True):
             stream.set_state(stored)
+        self._noise = state.get("noise")  # older checkpoints have none
         self._updates = int(state["updates"])
 
     def _update(self) -> None:

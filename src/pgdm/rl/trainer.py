@@ -144,7 +144,7 @@ class Trainer:
         )
         self._collector = RolloutCollector(
             env,
-            TensorDictModule(self._learner.model.sample, ["observation"], ["action", "loc"]),
+            TensorDictModule(self._learner.explore, ["observation"], ["action", "loc"]),
             frames_per_batch=env.num_envs * cfg.algo.steps_per_env,
             seed=cfg.seed,
             learner=self._learner,
