@@ -6,9 +6,9 @@
     python benchmark/learning.py --settings fast --seeds 0
     python benchmark/learning.py --collect          collect only, also from running runs
 
-There are five settings, each the same for all tasks: `+experiment=fast`, the same with a clipped or
-a feasible wrist path instead of a plan, `algo=ppo_fast action=residual`, and the paper's PPO with
-its actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two runs train at a
+There are six settings, each the same for all tasks: `+experiment=fast`; the same with linear
+corrections and uncorrelated noise, as it was earlier; this with a clipped or a feasible wrist path
+instead of a plan; `algo=ppo_fast action=residual`; and the paper's PPO with its actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two runs train at a
 time, one thread each.
 """
 
@@ -36,10 +36,12 @@ EARLY = 300_000
 
 QUICK6 = suite("quick6")
 FAST = ("+experiment=fast", "eval.interval_frames=50000")
+EARLIER = (*FAST, "action.residual_power=1", "algo.noise_correlation=0")
 SETTINGS = {
     "fast": FAST,
-    "fast-clipped": (*FAST, "action.wrist_path=clipped"),
-    "fast-feasible": (*FAST, "action.wrist_path=feasible"),
+    "fast-earlier": EARLIER,
+    "fast-clipped": (*EARLIER, "action.wrist_path=clipped"),
+    "fast-feasible": (*EARLIER, "action.wrist_path=feasible"),
     "ppo_fast-residual": ("algo=ppo_fast", "action=residual", "eval.interval_frames=100000"),
     "ppo-absolute": ("algo=ppo", "action=absolute", "eval.interval_frames=100000"),
 }
