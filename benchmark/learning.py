@@ -7,9 +7,10 @@
     python benchmark/learning.py --collect          collect only, also from running runs
 
 There are six settings, each the same for all tasks: `+experiment=fast`; the same with linear
-corrections and uncorrelated noise, as it was earlier; this with a clipped or a feasible wrist path
-instead of a plan; `algo=ppo_fast action=residual`; and the paper's PPO with its actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two runs train at a
-time, one thread each.
+corrections, uncorrelated noise and without an average, as it was earlier; this with a clipped or a
+feasible wrist path instead of a plan; `algo=ppo_fast action=residual`; and the paper's PPO with its
+actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two runs train at a time,
+one thread each.
 """
 
 from __future__ import annotations
@@ -36,7 +37,12 @@ EARLY = 300_000
 
 QUICK6 = suite("quick6")
 FAST = ("+experiment=fast", "eval.interval_frames=50000")
-EARLIER = (*FAST, "action.residual_power=1", "algo.noise_correlation=0")
+EARLIER = (
+    *FAST,
+    "action.residual_power=1",
+    "algo.noise_correlation=0",
+    "algo.average_rate=0",
+)
 SETTINGS = {
     "fast": FAST,
     "fast-earlier": EARLIER,

@@ -27,6 +27,8 @@ from toy_envs import TOY_SAC, PointEnv, trainer_cfg
 SHORT = replace(TOY_SAC, steps_per_env=8, warmup_steps=8, batch_size=32)
 """64 frames an iteration; the first one is the warm-up."""
 D, A, M = 5, 2, 64
+TRAINED = "actor_network_params.module.0.module"
+"""Prefix of the trained policy in the loss's state."""
 
 
 class Lines(Callback):
@@ -98,6 +100,21 @@ def test_the_exploration_noise_is_standard_normal_and_correlated_over_steps() ->
     assert (noise.std(1) - 1).abs().max() < 0.05
     lag = [float((noise[0] * noise[k]).mean()) for k in (1, 5)]
     assert lag == pytest.approx([0.9, 0.9**5], abs=0.05)
+
+
+def test_the_average_follows_the_trained_policy_and_shares_its_statistics() -> None:
+    env = PointEnv()
+    learner = build(env, replace(SHORT, average_rate=0.25, actor_interval=1, warmup_steps=1))
+    before = {name: p.detach().clone() for name, p in learner.model.net.named_parameters()}
+    learner.after_step(one_step(env, obs=torch.randn(env.num_envs, D)))
+    learner.during_step()  # one update
+    trained = learner.state_dict()["loss"]
+    assert not torch.equal(before["6.bias"], trained[f"{TRAINED}.net.6.bias"])
+    for name, mean in learner.model.net.named_parameters():
+        expected = before[name] + 0.25 * (trained[f"{TRAINED}.net.{name}"] - before[name])
+        torch.testing.assert_close(mean.detach(), expected)
+    assert torch.equal(learner.model.normalizer.mean, trained[f"{TRAINED}.normalizer.mean"])
+    assert learner.model.normalizer.mean.abs().sum() > 0
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])

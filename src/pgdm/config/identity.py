@@ -46,6 +46,7 @@ ADDED_LATER: dict[str, Any] = {
     "action.hold_steps": 0,
     "action.carry_load": False,
     "action.residual_power": 1.0,
+    "algo.average_rate": 0.0,
     "algo.learner": "ppo",
     "algo.noise_correlation": 0.0,
     "keep_replay": False,
@@ -58,7 +59,7 @@ ADDED_LATER: dict[str, Any] = {
     "time_limit_min": None,
 }
 
-_ONLY_SAC = ("algo.noise_correlation",)  # PPO has no such key
+_ONLY_SAC = ("algo.average_rate", "algo.noise_correlation")  # PPO has no such keys
 
 # Keys that have an effect only if the wrist is planned.
 _ONLY_PLANNED = ("action.hold_steps", "action.carry_load")

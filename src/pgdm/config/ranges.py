@@ -61,7 +61,13 @@ _ABOVE_ZERO = (
     "algo.temperature_init",
     "checkpoint.interval_s",
 )
-_SHARES = ("algo.gamma", "algo.gae_lambda", "algo.target_rate", "algo.noise_correlation")
+_SHARES = (
+    "algo.gamma",
+    "algo.gae_lambda",
+    "algo.target_rate",
+    "algo.noise_correlation",
+    "algo.average_rate",
+)
 
 
 def check_ranges(flat: Mapping[str, object]) -> None:

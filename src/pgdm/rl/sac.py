@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -56,6 +57,9 @@ class SACCfg(AlgoCfg):
     """Weight of the entropy in the return at the start."""
     noise_correlation: float
     """Correlation of the exploration noise between consecutive control steps, 0..1; 0: none."""
+    average_rate: float
+    """Fraction by which the averaged policy moves towards the trained one after each of its
+    updates, 0..1; 0: no average, the trained policy is evaluated and stored."""
     warmup_steps: int
     """Control steps of all simulations before the first update."""
     bfloat16: bool
@@ -130,14 +134,17 @@ class SACLearner:
             observation_clip=cfg.observation_clip,
         )
         bias = env.warm_start() if cfg.warm_start else None
-        self.model = SquashedPolicy(network, weights, bias).to(device)
+        self._policy = self.model = SquashedPolicy(network, weights, bias).to(device)
+        if cfg.average_rate:
+            self.model = copy.deepcopy(self._policy)
+            self.model.normalizer = self._policy.normalizer
         critics = [
             ActionValue(env.obs_dim, env.action_dim, cfg.hidden, weights).to(device)
             for _ in range(cfg.critics)
         ]
         self._actions = torch_stream(seed, "policy")
         self._loss = SoftActorCriticLoss(
-            self.model,
+            self._policy,
             critics,
             gamma=cfg.gamma,
             temperature=cfg.temperature_init,
@@ -175,13 +182,13 @@ class SACLearner:
         """
         rho = self.cfg.noise_correlation
         if not rho:
-            return self.model.sample(obs)
+            return self._policy.sample(obs)
         fresh = torch.randn(len(obs), self._env.action_dim)
         if self._noise is None:
             self._noise = fresh
         else:
             self._noise = rho * self._noise + math.sqrt(1 - rho * rho) * fresh
-        return self.model.sample(obs, noise=self._noise)
+        return self._policy.sample(obs, noise=self._noise)
 
     def during_step(self) -> None:
         """Make the updates of one control step; none during the first ``warmup_steps``.
@@ -278,9 +285,17 @@ class SACLearner:
                 "temperature": self._loss.log_alpha.detach().exp(),
             }
             self._step("policy", policy)
+            self._average()
             self._step("temperature", temperature)
         self._targets.step()
         self._logged.append(logged)
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        if self.model is not self._policy:
+            trained = self._policy.net.parameters()
+            for mean, value in zip(self.model.net.parameters(), trained, strict=True):
+                mean.lerp_(value, self.cfg.average_rate)
 
     def _target_entropy(self) -> float:
         cfg, passed = self.cfg, len(self._replay) / self.cfg.target_entropy_frames
