@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,10 +14,12 @@ from rich.console import Console
 
 from pgdm.cli.console.sweep_table import failures, live_table, span, summary_line
 from pgdm.cli.sweep import FRONT
+from pgdm.errors import SweepError
 from pgdm.memory import free_bytes
 from pgdm.runs.log import RunLog
 from pgdm.stop import StopRequest
 from pgdm.sweep.driver import Driver
+from pgdm.sweep.launcher import Assignment
 from pgdm.sweep.ledger import Ending, Ledger
 from pgdm.sweep.local import LocalLauncher, Room, room
 from pgdm.sweep.processes import Process
@@ -232,3 +235,25 @@ def test_a_worker_that_exits_with_0_before_its_run_is_finished_has_failed(tmp_pa
     error = "exited with code 0, but its run is unfinished: 0 of 32 frames"
     assert (attempt.state, attempt.exit_code, attempt.error) == ("failed", 0, error)
     assert heard[0] == f"seed=0: attempt 1 failed: {error}"
+
+
+def test_if_one_worker_cannot_be_started_none_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, begun = plan(tmp_path, 2), []
+
+    class Begun(subprocess.Popen[bytes]):
+        def __init__(self, *args: object, **kwargs: object) -> None:
+            super().__init__(*args, **kwargs)  # type: ignore[call-overload]
+            begun.append(self)
+
+    launcher = LocalLauncher(whole, LOCAL, (sys.executable, "-c", "import time; time.sleep(60)"))
+    log_path(tmp_path, "seed=1", 1).mkdir(parents=True)  # where its log would be
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, "Popen", Begun)
+        with pytest.raises(
+            SweepError, match=r"cannot start the worker of seed=1, .*1\.1\.log: Is a"
+        ):
+            launcher.start([Assignment(job, 1) for job in whole.jobs])
+    assert [process.poll() for process in begun] == [-signal.SIGKILL]
+    launcher.end(0.0)  # knows of none
