@@ -182,6 +182,11 @@ def test_rows_that_are_no_poses_are_named(
         ("a.csv", b"a,b,c,d,e,f,g\n1,2,3,1,0,0,0\n", "has 0 columns 'x' among a, b"),
         ("a.csv", b"x_mm,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n", "has 0 columns 'x' among x_mm"),
         ("a.csv", b"x,y,z,w,x,y,z\n1,2,3,1,0,0,0\n", "has 2 columns 'x'"),
+        (
+            "a.csv",
+            b"t,x,y,z,qx,qy,qz,qw,secs\n0,1,2,3,0,0,0,1,0\n",
+            "columns t, secs are all times",
+        ),
         ("a.csv", b"x,y,z,roll,pitch,yaw\n1,2,3,0,0,0\n", "has 0 columns 'qw'"),
         ("a.csv", b"x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0\n", "rows have 6 columns, expected 7"),
         ("a.csv", b"vel.x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n", "has 0 columns 'x'"),

@@ -142,3 +142,14 @@ def test_names_of_columns_that_are_no_names(tmp_path: Path) -> None:
     file.write_text(json.dumps({"poses": [[0.0] * 7] * 3, "columns": [["x", "y"], ["z"]]}))
     with pytest.raises(PgdmError, match="not a list of names"):
         pose_file.read(file)
+
+
+def test_times_are_stated_once() -> None:
+    names, rows = ["t", "x", "y", "z", "qw", "qx", "qy", "qz"], turned(line(0.2))
+    times = 0.02 * np.arange(30)
+    content = {"poses": np.column_stack((times, rows)).tolist(), "columns": names}
+    Path("a.json").write_text(json.dumps(content))
+    assert len(pose_file.read(Path("a.json")).pos) == 15
+    Path("a.json").write_text(json.dumps({**content, "time": times.tolist()}))
+    with pytest.raises(PgdmError, match="has times in 'time' and in a column; keep one"):
+        pose_file.read(Path("a.json"))

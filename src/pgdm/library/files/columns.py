@@ -51,7 +51,7 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
 
     Raises:
         CorruptAssetError: rows do not have C columns, a column of the pose is missing, or two have
-            the same meaning. (Of several time columns, the first is used.)
+            the same meaning.
     """
     if rows.ndim != 2 or rows.shape[1] != len(names):
         raise CorruptAssetError(
@@ -65,6 +65,11 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
                 f"{', '.join(names)}; a pose takes {', '.join(POSE)} (lengths in m), "
                 "and optionally time (s)"
             )
+    clocks = [name for name, meaning in zip(names, meanings, strict=True) if meaning == "time"]
+    if len(clocks) > 1:
+        raise CorruptAssetError(
+            f"{label}: the columns {', '.join(clocks)} are all times; keep one, in s"
+        )
     times = rows[:, meanings.index("time")] if "time" in meanings else None
     others = [name for name, meaning in zip(names, meanings, strict=True) if not meaning]
     notes = [f"left out the columns {', '.join(others)}"] if others else []

@@ -228,6 +228,8 @@ def _with_names(
         raise CorruptAssetError(f"{path}: columns are {names!r:.60}, not a list of names")
     else:
         table = columns.by_name(rows, [str(name) for name in np.ravel(names)], str(path))
+        if times is not None and table.times is not None:
+            raise CorruptAssetError(f"{path}: has times in 'time' and in a column; keep one")
     others = sorted(str(key) for key in parts if key not in _PARTS)
     notes = [*table.notes, *([f"left out {', '.join(others)}"] if others else [])]
     return replace(table, times=table.times if times is None else times, notes=notes)
