@@ -153,3 +153,18 @@ def test_times_are_stated_once() -> None:
     Path("a.json").write_text(json.dumps({**content, "time": times.tolist()}))
     with pytest.raises(PgdmError, match="has times in 'time' and in a column; keep one"):
         pose_file.read(Path("a.json"))
+
+
+@pytest.mark.parametrize(
+    ("axes", "degrees", "said"),
+    [
+        ("z", [170], "is tilted by 170 degrees from .*, as x y z w only by 0;"),
+        ("zx", [5, 5], "is turned by 175 degrees from .*, as x y z w only by 7;"),
+    ],
+)
+def test_a_refused_start_is_told_by_the_angles_that_were_compared(
+    axes: str, degrees: list[float], said: str
+) -> None:
+    start = Rotation.from_euler(axes, degrees, degrees=True)
+    with pytest.raises(ConfigError, match=said):
+        check_order(start.as_quat(scalar_first=False), Rotation.identity(), "it", "name them")

@@ -98,17 +98,19 @@ def check_order(quat: np.ndarray, rest: Rotation, label: str, cure: str) -> None
 
     Raises:
         ConfigError: read as wxyz, the orientation is tilted or rotated far from the resting one;
-            read as xyzw, it is close by the same measure.
+            read as xyzw, it is close by the same measure. The message states that measure for both.
     """
     taken, other = (Rotation.from_quat(quat, scalar_first=f) * rest.inv() for f in (True, False))
     tilts = [float(np.arccos(np.clip(r.as_matrix()[2, 2], -1, 1))) for r in (taken, other)]
     tilted = tilts[0] > _TILTED_RAD and tilts[1] < _UPRIGHT_RAD
     flipped = taken.magnitude() > _FAR_RAD and other.magnitude() < _NEAR_RAD
     if tilted or (flipped and tilts[0] > tilts[1] - _LEVEL_RAD):
+        angles = tilts if tilted else [float(r.magnitude()) for r in (taken, other)]
+        wrong, right = (f"{angle:.0f}" for angle in np.rad2deg(angles))
         raise ConfigError(
-            f"{label}: read as w x y z its orientation is {np.rad2deg(taken.magnitude()):.0f} "
-            f"degrees from the object's resting orientation, as x y z w only "
-            f"{np.rad2deg(other.magnitude()):.0f}; {cure}"
+            f"{label}: read as w x y z its orientation is {'tilted' if tilted else 'turned'} by "
+            f"{wrong} degrees from the object's resting orientation, as x y z w only by {right}; "
+            f"{cure}"
         )
 
 
