@@ -322,6 +322,12 @@ def test_a_hundred_fingers_are_refused() -> None:
         author_hand(request(path))
 
 
+def test_a_file_with_too_many_joint_elements_is_refused_with_its_limit() -> None:
+    path = saved(f'<robot name="r"><link name="palm"/>{481 * "<joint/>"}</robot>')
+    with pytest.raises(PgdmError, match=r"1 bod.* 481 <joint> elements; .* at most 300 and 480$"):
+        author_hand(request(path))
+
+
 def test_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
     secret = tmp_path.parent / "secret.stl"
     trimesh.creation.box((0.02, 0.08, 0.09)).export(secret)
