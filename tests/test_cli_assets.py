@@ -88,7 +88,7 @@ def test_verify_names_what_is_damaged_and_fails(
         "checkout/objects/cup/meshes/contact0.stl: content changed, its SHA-256 differs from the "
         "recorded one"
     ]
-    assert err.startswith("error: 1 of ")
+    assert err.startswith("error: damaged files: 1 of ") and "'pgdm assets fetch'" in err
     assert err.count("\n") == 1
 
 

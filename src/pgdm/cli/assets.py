@@ -13,7 +13,7 @@ from pgdm import paths
 from pgdm.cli.console.screen import bars, confirmed, tables
 from pgdm.errors import check_name
 from pgdm.library import open_library, staging
-from pgdm.library.catalog import CURE
+from pgdm.library.catalog import CURE, file_cure
 from pgdm.library.checks.verify import damaged
 
 if TYPE_CHECKING:
@@ -161,11 +161,8 @@ def verify() -> None:
     for line in found:
         print(line)
     if found:
-        print(
-            f"error: {len(found)} of {files} files are damaged; run 'pgdm assets fetch' or "
-            "'pgdm assets import PATH' again",
-            file=sys.stderr,
-        )
+        cures = dict.fromkeys(file_cure(line.partition("/")[0]) for line in found)
+        print(f"error: damaged files: {len(found)} of {files}. {' '.join(cures)}", file=sys.stderr)
         raise typer.Exit(1)
     count = len(library.experts().experts)
     also = f" and {count} expert hand trajectories" if count else ""
