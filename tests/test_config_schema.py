@@ -77,6 +77,20 @@ def test_cuda_is_refused_where_there_is_none() -> None:
             compose(["device=cuda"])
 
 
+def test_a_gpu_that_the_machine_lacks_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    for device in ("cuda", "cuda:0", "cuda:1"):
+        assert compose([f"device={device}"]).device == device
+    with pytest.raises(ConfigError, match=r"device is cuda:7, .* valid: cuda:0, cuda:1$"):
+        compose(["device=cuda:7"])
+    for wrong in ("cuda:", "cuda:x", "cuda:-1", "cpu:0"):
+        with pytest.raises(ConfigError, match=f"unknown device '{wrong}'"):
+            compose([f"device='{wrong}'"])
+
+
 def fields(cls: type, path: str = "") -> dict[str, type]:
     """Return all keys of a configuration, dotted, with the dataclass that has them."""
     found: dict[str, type] = {}

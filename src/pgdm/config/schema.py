@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -105,8 +106,8 @@ class ExperimentCfg:
         self._check_hand()
         self._check_expert()
         self._check_placements()
-        if self.device.partition(":")[0] not in ("cpu", "cuda"):
-            raise UnknownNameError("device", self.device, ("cpu", "cuda"))
+        if not re.fullmatch("cpu|cuda(:[0-9]+)?", self.device):
+            raise UnknownNameError("device", self.device, ("cpu", "cuda", "cuda:N"))
         if not self.run_dir.strip():
             raise ConfigError("run_dir is empty; name a folder, or null for the default")
         if not self.budget.strip():
@@ -199,7 +200,7 @@ def check_device(device: str) -> None:
     """Check that this machine has the device. Stored runs can be read without it.
 
     Raises:
-        ConfigError: if the machine lacks it.
+        ConfigError: if the machine lacks it; the message names the GPUs that it has.
     """
     if device.startswith("cuda"):
         # Imported only here: looking for a GPU takes time, and most runs use none.
@@ -207,3 +208,8 @@ def check_device(device: str) -> None:
 
         if not torch.cuda.is_available():
             raise ConfigError(f"device is {device}, but torch finds no GPU here; use device=cpu")
+        have = [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+        if device not in ("cuda", *have):
+            raise ConfigError(
+                f"device is {device}, which torch does not find here; valid: {', '.join(have)}"
+            )
