@@ -259,7 +259,7 @@ FAULTS: dict[str, tuple[str, str]] = {
         "refers to '/etc/palm.stl', outside of",
     ),
     "no fingers": (urdf(()), "0 joints; a hand has 1 to"),
-    "one finger": (urdf(("index",)), "1 chains of joints end in a fingertip"),
+    "one finger": (urdf(("index",)), "chains of joints that end in a fingertip: 1 "),
     "mimics nobody": (
         urdf(mimic=True).replace('<mimic joint="index_j1"', '<mimic joint="nobody"'),
         "joint 'index_j2' mimics 'nobody', which is not a joint",

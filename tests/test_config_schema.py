@@ -57,7 +57,7 @@ from pgdm.methods import METHODS
         (["method.name='pgdm.methods.method:'"], "not of the form my_package.module:attribute"),
         (["run_dir=''"], "run_dir is empty"),
         (["task.objects=[]"], "task.objects is empty"),
-        (["task.placements=[{body: a, pos_m: [1], quat: null}]"], "pos_m has 1 numbers, not 3"),
+        (["task.placements=[{body: a, pos_m: [1], quat: null}]"], "pos_m has 1 number, not 3"),
         (["task.placements=[{body: a, pos_m: null, quat: [0,0,0,0]}]"], "quat is zero"),
         (["hand.fingertips=[16]"], "fingertips has 16, but hand.points has 16 entries"),
     ],

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pgdm.config.ranges import check_ranges
 from pgdm.config.strict import ChosenBy
-from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.errors import ConfigError, UnknownNameError, amount
 from pgdm.library.files import expert as expert_file
 from pgdm.library.tasks import MOCAP_TASKS
 from pgdm.mdp.actions import KINDS, WRIST_PATHS, ActionCfg
@@ -131,8 +131,8 @@ class ExperimentCfg:
         wrong = [i for i in hand.fingertips if not 0 <= i < len(hand.points)]
         if wrong:
             raise ConfigError(
-                f"hand.fingertips has {wrong[0]}, but hand.points has {len(hand.points)} entries: "
-                f"use 0 to {len(hand.points) - 1}"
+                f"hand.fingertips has {wrong[0]}, but hand.points has "
+                f"{amount(len(hand.points), 'entry', 'entries')}: use 0 to {len(hand.points) - 1}"
             )
 
     def _check_expert(self) -> None:
@@ -163,7 +163,8 @@ class ExperimentCfg:
                 value = getattr(placement, name)
                 if value is not None and len(value) != size:
                     raise ConfigError(
-                        f"task.placements[{i}].{name} has {len(value)} numbers, not {size}"
+                        f"task.placements[{i}].{name} has "
+                        f"{amount(len(value), 'number')}, not {size}"
                     )
             if placement.quat is not None and sum(q * q for q in placement.quat) == 0:
                 raise ConfigError(

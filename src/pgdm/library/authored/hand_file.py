@@ -18,7 +18,7 @@ from pathlib import Path
 import mujoco
 
 from pgdm import files, limited
-from pgdm.errors import ConfigError, CorruptAssetError, LimitError
+from pgdm.errors import ConfigError, CorruptAssetError, LimitError, amount
 from pgdm.library.files import mjcf
 from pgdm.library.files.model import check_stays
 
@@ -140,8 +140,8 @@ def _check_numbers(element: ET.Element, label: str) -> None:
     bodies = sum(item.tag in ("body", "link") for item in element.iter())
     if joints > MOST_JOINT_ELEMENTS or bodies > MOST_BODIES:
         raise CorruptAssetError(
-            f"{label}: has {bodies} bodies and {joints} <joint> elements; a hand's file has at "
-            f"most {MOST_BODIES} and {MOST_JOINT_ELEMENTS}"
+            f"{label}: has {amount(bodies, 'body', 'bodies')} and {joints} <joint> elements; a "
+            f"hand's file has at most {MOST_BODIES} and {MOST_JOINT_ELEMENTS}"
         )
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pgdm.errors import ConfigError, CorruptAssetError
+from pgdm.errors import ConfigError, CorruptAssetError, amount
 
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 """Columns of a pose, in the order of a table without names."""
@@ -55,7 +55,8 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
     """
     if rows.ndim != 2 or rows.shape[1] != len(names):
         raise CorruptAssetError(
-            f"{label}: rows have shape {rows.shape} for {len(names)} columns: {', '.join(names)}"
+            f"{label}: rows have shape {rows.shape} for {amount(len(names), 'column')}: "
+            f"{', '.join(names)}"
         )
     meanings = [_meaning(name) for name in names]
     for wanted in POSE:

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from pgdm import files
-from pgdm.errors import ConfigError, CorruptAssetError
+from pgdm.errors import ConfigError, CorruptAssetError, amount
 from pgdm.library.files import columns, npz
 from pgdm.library.files.columns import Table
 from pgdm.library.files.keyframes import LONGEST_S, continuous
@@ -121,7 +121,9 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
 
 def _check_times(times: np.ndarray, count: int, label: str) -> None:
     if times.shape != (count,) or not np.isfinite(times).all():
-        raise CorruptAssetError(f"{label}: has {times.size} times, needs {count} finite ones")
+        raise CorruptAssetError(
+            f"{label}: has {amount(times.size, 'time')}, needs {count} finite ones"
+        )
     if bad := _first(np.diff(times) <= 0):
         raise CorruptAssetError(
             f"{label}: row {bad} has time {times[bad]:g} s, not after {times[bad - 1]:g} s"
@@ -151,7 +153,7 @@ def _csv(path: Path) -> Table:
     if widths not in ([{len(names)}] if names else [{7}, {8}]):
         expected = len(names) or "7 (x y z qw qx qy qz) or 8 (time before them)"
         raise CorruptAssetError(
-            f"{path}: rows have {' and '.join(map(str, sorted(widths))) or 'no'} columns, expected "
+            f"{path}: columns of the rows: {' and '.join(map(str, sorted(widths))) or 0}, expected "
             f"{expected}"
         )
     for i, line in enumerate(lines):
