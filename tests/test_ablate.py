@@ -243,7 +243,7 @@ def test_wrong_values_are_named() -> None:
 
 @pytest.mark.usefixtures("library_home")
 def test_a_hand_without_its_mean_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"mean_fingers_rad has 1 numbers, but hand 'adroit'"):
+    with pytest.raises(ConfigError, match=r"mean_fingers_rad has 1 number, but hand 'adroit'"):
         wrong = ["hand.mean_fingers_rad=[0.5]"]
         pgdm.make_batch("duck-lift", num_envs=1, ablation="mean_hand", overrides=wrong)
 

@@ -259,7 +259,7 @@ FAULTS: dict[str, tuple[str, str]] = {
         "refers to '/etc/palm.stl', outside of",
     ),
     "no fingers": (urdf(()), "0 joints; a hand has 1 to"),
-    "one finger": (urdf(("index",)), "1 chains of joints end in a fingertip"),
+    "one finger": (urdf(("index",)), "chains of joints that end in a fingertip: 1 "),
     "mimics nobody": (
         urdf(mimic=True).replace('<mimic joint="index_j1"', '<mimic joint="nobody"'),
         "joint 'index_j2' mimics 'nobody', which is not a joint",
@@ -319,6 +319,12 @@ def test_a_hundred_fingers_are_refused() -> None:
     )
     path = saved(f'<robot name="r"><link name="palm"/>{links}</robot>')
     with pytest.raises(PgdmError, match="100 joints; a hand has 1 to 60"):
+        author_hand(request(path))
+
+
+def test_a_file_with_too_many_joint_elements_is_refused_with_its_limit() -> None:
+    path = saved(f'<robot name="r"><link name="palm"/>{481 * "<joint/>"}</robot>')
+    with pytest.raises(PgdmError, match=r"1 bod.* 481 <joint> elements; .* at most 300 and 480$"):
         author_hand(request(path))
 
 

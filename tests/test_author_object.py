@@ -61,6 +61,11 @@ def test_it_has_the_form_of_the_librarys_objects() -> None:
     mesh = library.folder("own") / "objects/brick/meshes/contact0.stl"
     mesh.write_bytes(mesh.read_bytes()[:-1])
     assert "own/objects/brick/meshes/contact0.stl" in damaged(library)[0]
+    verified = command("pgdm", "assets", "verify")
+    assert verified.code == 1 and "'pgdm author'" in verified.err and "fetch" not in verified.err
+    (library.folder("own") / "objects/brick/object.xml").unlink()
+    with pytest.raises(LibraryError, match=r"object\.xml: missing .* again with 'pgdm author', or"):
+        library.object_xml("brick")
 
 
 def test_a_known_mass_counts_and_the_density_otherwise() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -212,6 +213,11 @@ def test_the_animated_tasks_are_compiled_on_demand_and_once(fresh_home: Path) ->
         os.stat(ensure(animated.TASKS[1], True).motion_path(animated.TASKS[0])).st_mtime_ns == made
     )
     assert damaged(first) == []
+    path.unlink()
+    with pytest.raises(LibraryError, match=r"missing .* Remove the library's folder 'animated'; "):
+        first.motion_path(animated.TASKS[0])
+    shutil.rmtree(fresh_home / "library" / "animated")
+    assert ensure(animated.TASKS[0], True).motion_path(animated.TASKS[0]) == path
     manifest = fresh_home / "library" / "animated" / "manifest.json"
     manifest.write_text(manifest.read_text().replace(animated.origin(), "older keyframes"))
     assert ensure(animated.TASKS[0], True).sources()["animated"].origin == animated.origin()

@@ -42,7 +42,7 @@ def test_import_reports_tasks_and_defects(
     code, out, _ = run(capsys, "import", str(checkout))
     assert code == 0
     assert out.splitlines() == [
-        "2 tasks are in the library from this source",
+        "the library has 2 tasks from this source",
         "defect in the source: tcdm/envs/assets/robots/dmanus/base.xml: geom "
         'euler="0.114 0 0w" read as "0.114 0 0"',
     ]
@@ -88,7 +88,7 @@ def test_verify_names_what_is_damaged_and_fails(
         "checkout/objects/cup/meshes/contact0.stl: content changed, its SHA-256 differs from the "
         "recorded one"
     ]
-    assert err.startswith("error: 1 of ")
+    assert err.startswith("error: damaged files: 1 of ") and "'pgdm assets fetch'" in err
     assert err.count("\n") == 1
 
 

@@ -141,7 +141,7 @@ def test_another_sweep_of_the_same_name_is_refused(monkeypatch: pytest.MonkeyPat
     changed = command("pgdm-run", *line, "algo.clip=0.1")
     assert changed.code == 1
     assert len(changed.errors) == 1
-    assert "algo.clip: 0.2 -> 0.1; 1 more jobs differ too" in changed.errors[0]
+    assert "algo.clip: 0.2 -> 0.1; other settings also in 1 more job" in changed.errors[0]
     assert "choose another sweep.name" in changed.errors[0]
     dry = command("pgdm-run", *line, "algo.clip=0.1", "--dry-run")
     assert "algo.clip: 0.2 -> 0.1" in dry.err
@@ -161,7 +161,7 @@ def test_what_is_finished_is_counted(library_home: Path) -> None:
     rows = shown(command("pgdm-run", *line, "--dry-run"))
     assert rows["jobs"] == "2 (1 finished, 0 begun)"
     assert rows["frames"] == "32 a job, 64 in all, 32 left"
-    assert "measured in 1 earlier runs" in rows["time"]
+    assert "measured in 1 earlier run" in rows["time"]
 
 
 def test_a_start_that_no_run_would_find_refuses_the_sweep(library_home: Path) -> None:
@@ -201,7 +201,7 @@ def test_what_the_assets_here_have_not_is_told() -> None:
         )
     ]
     start, lacking, approximate = foresee(cfgs, library)
-    assert start.startswith("2 runs with pregrasp=planned start from 'mined'")
+    assert start.startswith("pregrasp=planned: 2 runs will start from 'mined'")
     assert lacking.endswith("here: door-open")
     assert approximate.endswith("approximate: piggybank-use1")
 
@@ -213,7 +213,7 @@ def test_a_sweep_says_that_wrists_are_planned_first(library_home: Path) -> None:
         for task in tasks
         for seed in (0, 1)
     ]
-    assert any("2 tasks need a wrist plan" in text for text in foresee(cfgs, open_library()))
+    assert any("2 tasks with a wrist plan" in text for text in foresee(cfgs, open_library()))
     assert not any("wrist" in text for text in foresee([compose([])], open_library()))
 
 

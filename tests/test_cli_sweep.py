@@ -97,9 +97,9 @@ def test_logs(ended: Path) -> None:
 
 
 def test_cancel_what_does_not_run(ended: Path) -> None:
-    assert "cancelled 1 jobs" in sweep("cancel", ended).out
+    assert "cancelled 1 job;" in sweep("cancel", ended).out
     assert list(Ledger(ended).states().values()) == ["finished", "failed", "cancelled"]
-    assert "cancelled 1 jobs" in sweep("cancel", ended, "seed=1").out
+    assert "cancelled 1 job;" in sweep("cancel", ended, "seed=1").out
     assert list(Ledger(ended).states().values()) == ["finished", "cancelled", "cancelled"]
 
 
@@ -150,10 +150,10 @@ def test_a_sweep_in_the_background(library_home: Path, tmp_path: Path) -> None:
     again = sweep("resume", folder)
     assert "already" in again.errors[0] and "pgdm sweep cancel" in again.errors[0]
 
-    assert "cancelled 1 jobs" in sweep("cancel", folder, "seed=0").out
+    assert "cancelled 1 job;" in sweep("cancel", folder, "seed=0").out
     assert [job["state"] for job in status_of(folder)["jobs"]][:2] == ["cancelled", "running"]
     assert "retried by the running sweep" in sweep("retry", folder, "seed=0").out
-    assert "cancelled 3 jobs" in sweep("cancel", folder).out
+    assert "cancelled 3 jobs;" in sweep("cancel", folder).out
     out, err = watching.communicate(timeout=60)
     assert "3 cancelled" in out, err
     assert [job["state"] for job in status_of(folder)["jobs"]] == ["cancelled"] * 3

@@ -57,7 +57,7 @@ from pgdm.methods import METHODS
         (["method.name='pgdm.methods.method:'"], "not of the form my_package.module:attribute"),
         (["run_dir=''"], "run_dir is empty"),
         (["task.objects=[]"], "task.objects is empty"),
-        (["task.placements=[{body: a, pos_m: [1], quat: null}]"], "pos_m has 1 numbers, not 3"),
+        (["task.placements=[{body: a, pos_m: [1], quat: null}]"], "pos_m has 1 number, not 3"),
         (["task.placements=[{body: a, pos_m: null, quat: [0,0,0,0]}]"], "quat is zero"),
         (["hand.fingertips=[16]"], "fingertips has 16, but hand.points has 16 entries"),
     ],
@@ -75,6 +75,20 @@ def test_cuda_is_refused_where_there_is_none() -> None:
     else:
         with pytest.raises(ConfigError, match="torch finds no GPU here; use device=cpu"):
             compose(["device=cuda"])
+
+
+def test_a_gpu_that_the_machine_lacks_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    for device in ("cuda", "cuda:0", "cuda:1"):
+        assert compose([f"device={device}"]).device == device
+    with pytest.raises(ConfigError, match=r"device is cuda:7, .* valid: cuda:0, cuda:1$"):
+        compose(["device=cuda:7"])
+    for wrong in ("cuda:", "cuda:x", "cuda:-1", "cpu:0"):
+        with pytest.raises(ConfigError, match=f"unknown device '{wrong}'"):
+            compose([f"device='{wrong}'"])
 
 
 def fields(cls: type, path: str = "") -> dict[str, type]:

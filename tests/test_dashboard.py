@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from command_line import command
 from fake_runs import empty_database, end, make, train
 from pgdm.cli.dashboard import HOST, _command, dashboard, free_port
 from pgdm.errors import RunError
@@ -37,7 +38,13 @@ def test_port_that_is_taken_is_not_used() -> None:
         other = free_port(taken)
         assert other != taken
     assert free_port(other) == other
-    assert 0 < free_port(99999) < 65536
+
+
+@pytest.mark.parametrize("words", ["dashboard", "pregrasp label hammer-use1"])
+def test_port_is_at_most_65535(words: str) -> None:
+    for port in ("99999", "-1"):
+        found = command("pgdm", *words.split(), "--port", port)
+        assert found.code == 2 and f"--port {port} is no port: give 1 to 65535" in found.err
 
 
 def test_folder_without_runs_is_one_line(tmp_path: Path) -> None:
@@ -86,7 +93,7 @@ def served(folder: RunFolder, tmp_path: Path) -> Iterator[tuple[subprocess.Popen
     """Start the command as from a terminal, in an environment that is not activated."""
     env = {**os.environ, "PATH": "/usr/bin:/bin", "PYTHONUNBUFFERED": "1"}
     env.pop("VIRTUAL_ENV", None)
-    command = [sys.executable, "-c", PROGRAM, "--port", str(free_port(0))]
+    command = [sys.executable, "-c", PROGRAM, "--port", "0"]
     process = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     lines = []
@@ -95,7 +102,7 @@ def served(folder: RunFolder, tmp_path: Path) -> Iterator[tuple[subprocess.Popen
         if "Ctrl-C" in line:
             break
     found = re.search(rf"http://{HOST}:\d+/\S+", "".join(lines))
-    assert found, lines
+    assert found and "is taken" not in "".join(lines), lines
     yield process, found.group()
     process.send_signal(signal.SIGINT)  # if killed it could not stop its server
     process.wait(60)

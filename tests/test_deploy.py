@@ -171,6 +171,14 @@ def test_the_mount_pose_is_that_of_the_simulation(scene: Scene) -> None:
 def test_settings_that_cannot_be_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"--speed is 0; it must be above 0"):
         ConvertCfg(speed=0).check()
+    with pytest.raises(ConfigError, match=r"--hold is -1; it must be at least 0"):
+        ConvertCfg(hold_s=-1).check()
+    for wrong in (float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match=f"--hold is {wrong}; it must be a finite number"):
+            ConvertCfg(hold_s=wrong).check()
+        with pytest.raises(ConfigError, match=f"--speed is {wrong}; it must be a finite number"):
+            ConvertCfg(speed=wrong).check()
+    ConvertCfg(hold_s=0).check()
     with pytest.raises(ConfigError, match="unknown --base 'planned'"):
         ConvertCfg(base="planned").check()
     with pytest.raises(ConfigError, match="above 3 m"):

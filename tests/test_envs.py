@@ -334,6 +334,16 @@ def test_stable_baselines3_trains_on_all_simulations_at_once() -> None:
     assert len(model.ep_info_buffer) > 0  # its own record of returns and lengths
 
 
+def test_each_interface_fixes_who_resets_and_says_so() -> None:
+    for auto_reset in (False, True):
+        with pytest.raises(ConfigError, match="make_torchrl has no argument 'auto_reset'; leave"):
+            pgdm.make_torchrl("dmanus-crackerbox", auto_reset=auto_reset)
+    with pytest.raises(ConfigError, match="make_sb3: auto_reset is False; it must be True"):
+        pgdm.make_sb3("dmanus-crackerbox", auto_reset=False)
+    with pytest.raises(ConfigError, match="make_gym has no argument 'num_envs'; leave it out: a G"):
+        gymnasium.make("pgdm/dmanus-crackerbox-v0", num_envs=2)
+
+
 def test_make_sb3_without_stable_baselines3_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -156,9 +156,9 @@ def test_what_the_settings_say_must_be_in_the_model() -> None:
     assert actuators(XML) == list(range(8))
     with pytest.raises(SceneError, match=r"hand.num_base_joints is 3; it must be 6"):
         actuators(XML, replace(HAND, num_base_joints=3))
-    with pytest.raises(SceneError, match=r"there are 8 joints 'h/...', fewer than"):
+    with pytest.raises(SceneError, match=r"it has 8 joints 'h/...', fewer than"):
         actuators(XML, replace(HAND, num_wrist_joints=3))
-    with pytest.raises(SceneError, match=r"there are 0 joints 'k/...', fewer than .*must be 'k'"):
+    with pytest.raises(SceneError, match=r"it has 0 joints 'k/...', fewer than .*must be 'k'"):
         actuators(XML, replace(HAND, name="k"))
     with pytest.raises(SceneError, match=r"must be a slide .* mount body 'h/finger'"):
         actuators(XML, replace(HAND, mount_body="finger"))

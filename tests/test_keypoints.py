@@ -156,7 +156,7 @@ def test_the_objects_pose_comes_with_it(ending: str, tmp_path: Path) -> None:
         ("a.csv", "x,y,z\n1,2,3\n", "frame,joint,x,y,z"),
         ("a.csv", "frame,joint,x,y,z\n0,0,1,2\n", "row 2"),
         ("a.csv", "frame,joint,x,y,z\n0,0,1,2,3\n0,0,1,2,3\n", "repeats joint 0 of frame 0"),
-        ("a.csv", "frame,joint,x,y,z\n0,15,1,2,3\n", "1 rows for 1 frames"),
+        ("a.csv", "frame,joint,x,y,z\n0,15,1,2,3\n", "1 row for 1 frame;"),
         ("a.csv", "", "frame,joint,x,y,z"),
         ("a.npz", "no zip", "not a readable .npz"),
         ("a.txt", "", r"extension of a.txt"),

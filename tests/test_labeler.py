@@ -346,8 +346,11 @@ def test_damaged_draft_is_set_aside() -> None:
     draft = Draft(scene)
     found = draft.found(poses_of(TASK))
     assert found is not None and found.origin == "planned pre-grasp"
-    assert "kept as labeled.draft-before.npz" in found.notes[-1]
-    assert path.with_name("labeled.draft-before.npz").read_bytes() == b"half a file"
+    assert "kept as labeled.draft-before-1.npz" in found.notes[-1]
+    path.write_bytes(b"half another")
+    assert draft.set_aside().name == "labeled.draft-before-2.npz"
+    kept = [path.with_name(f"labeled.draft-before-{i}.npz").read_bytes() for i in (1, 2)]
+    assert kept == [b"half a file", b"half another"]
     draft.close()
 
 

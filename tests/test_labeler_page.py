@@ -301,7 +301,7 @@ def test_command_keeps_the_draft_however_it_is_stopped(chrome: Chromium) -> None
     kept = pregrasp_file.read(user / "labeled.draft.npz")
     assert abs(kept.pose.qpos[HEIGHT] + 0.13) < 1e-9
     process, printed, _ = started(0, "--from", "mined")
-    assert "an earlier draft is kept as labeled.draft-before.npz" in printed
+    assert "an earlier draft is kept as labeled.draft-before-1.npz" in printed
     ended(process, signal.SIGTERM)
     assert process.returncode == 0
 

@@ -68,7 +68,7 @@ def test_a_file_gives_back_what_was_written_and_always_the_same_bytes(tmp_path: 
         (arrays() | {"qpos": np.zeros((6, 24))}, r"'qpos' has shape \(6, 24\).*\(any, 30\)"),
         (arrays() | {"fingertips": np.zeros((5, 5, 3))}, r"'fingertips' has shape \(5, 5, 3\)"),
         (arrays() | {"qpos": np.array("text")}, "'qpos' is not numeric"),
-        (arrays(1), "qpos has 1 rows, needs 2"),
+        (arrays(1), "qpos has 1 row, needs 2"),
         ({"qpos": np.zeros((6, 30))}, "lacks 'human_joints'; it has qpos"),
     ],
 )

@@ -177,15 +177,24 @@ def test_rows_that_are_no_poses_are_named(
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("a.csv", b"1,2,3\n", "rows have 3 columns, expected 7"),
-        ("a.csv", b"", "rows have no columns"),
+        ("a.csv", b"1,2,3\n", "columns of the rows: 3, expected 7"),
+        ("a.csv", b"", "columns of the rows: 0, expected"),
         ("a.csv", b"a,b,c,d,e,f,g\n1,2,3,1,0,0,0\n", "has 0 columns 'x' among a, b"),
         ("a.csv", b"x_mm,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n", "has 0 columns 'x' among x_mm"),
         ("a.csv", b"x,y,z,w,x,y,z\n1,2,3,1,0,0,0\n", "has 2 columns 'x'"),
+        (
+            "a.csv",
+            b"t,x,y,z,qx,qy,qz,qw,secs\n0,1,2,3,0,0,0,1,0\n",
+            "columns t, secs are all times",
+        ),
         ("a.csv", b"x,y,z,roll,pitch,yaw\n1,2,3,0,0,0\n", "has 0 columns 'qw'"),
-        ("a.csv", b"x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0\n", "rows have 6 columns, expected 7"),
+        ("a.csv", b"x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0\n", "columns of the rows: 6, expected 7"),
         ("a.csv", b"vel.x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n", "has 0 columns 'x'"),
-        ("a.json", b'{"poses": [[1, 2]], "columns": ["x"]}', r"rows have shape \(1, 2\) for 1"),
+        (
+            "a.json",
+            b'{"poses": [[1, 2]], "columns": ["x"]}',
+            r"rows have shape \(1, 2\) for 1 column:",
+        ),
         ("a.json", b'[{"x": 1}, {"y": 2}]', "lacks 'x'"),
         ("a.csv", b"0,0,0,1,0,0,0\n0,0,x,1,0,0,0\n", "row 1 has 'x', not a number"),
         ("a.json", b"{}", "lacks 'poses'"),

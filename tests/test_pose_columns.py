@@ -142,3 +142,29 @@ def test_names_of_columns_that_are_no_names(tmp_path: Path) -> None:
     file.write_text(json.dumps({"poses": [[0.0] * 7] * 3, "columns": [["x", "y"], ["z"]]}))
     with pytest.raises(PgdmError, match="not a list of names"):
         pose_file.read(file)
+
+
+def test_times_are_stated_once() -> None:
+    names, rows = ["t", "x", "y", "z", "qw", "qx", "qy", "qz"], turned(line(0.2))
+    times = 0.02 * np.arange(30)
+    content = {"poses": np.column_stack((times, rows)).tolist(), "columns": names}
+    Path("a.json").write_text(json.dumps(content))
+    assert len(pose_file.read(Path("a.json")).pos) == 15
+    Path("a.json").write_text(json.dumps({**content, "time": times.tolist()}))
+    with pytest.raises(PgdmError, match="has times in 'time' and in a column; keep one"):
+        pose_file.read(Path("a.json"))
+
+
+@pytest.mark.parametrize(
+    ("axes", "degrees", "said"),
+    [
+        ("z", [170], "is tilted by 170 degrees from .*, as x y z w only by 0;"),
+        ("zx", [5, 5], "is turned by 175 degrees from .*, as x y z w only by 7;"),
+    ],
+)
+def test_a_refused_start_is_told_by_the_angles_that_were_compared(
+    axes: str, degrees: list[float], said: str
+) -> None:
+    start = Rotation.from_euler(axes, degrees, degrees=True)
+    with pytest.raises(ConfigError, match=said):
+        check_order(start.as_quat(scalar_first=False), Rotation.identity(), "it", "name them")

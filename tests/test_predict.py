@@ -167,7 +167,7 @@ def test_samples_depend_on_the_seed_alone_and_begin_with_the_mean(library_home: 
 
 def test_one_object_is_too_few(library_home: Path) -> None:
     examples, frame = made_up(3)
-    with pytest.raises(ConfigError, match=r"3 pre-grasps of 1 objects.*at least 2"):
+    with pytest.raises(ConfigError, match=r"3 pre-grasps of 1 object .*at least 2"):
         fit([replace(e, object="ball") for e in examples], frame)
 
 

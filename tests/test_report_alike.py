@@ -105,8 +105,8 @@ def test_the_engine_of_the_training_is_part_of_the_provenance(tmp_path: Path) ->
     make(root / "b", 0.5, "sim=warp", result={"engine": "MuJoCo Warp 4.0, float32, cuda"})
     page = text_of(report(root))
     assert "engine of the training" in page
-    assert "MuJoCo Warp 4.0, float32, cuda (1 runs)" in page
-    assert "C MuJoCo, float64 (1 runs)" in page
+    assert "MuJoCo Warp 4.0, float32, cuda (1 run)" in page
+    assert "C MuJoCo, float64 (1 run)" in page
 
 
 def test_the_experts_hand_is_part_of_the_provenance(tmp_path: Path) -> None:
@@ -117,4 +117,4 @@ def test_the_experts_hand_is_part_of_the_provenance(tmp_path: Path) -> None:
         made = "task=cup-pour1", "method=deepmimic", f"seed={1 + number}"
         make(root / f"{number}", 0.5, *made, result={"expert_hand": hand})
     page = text_of(report(root))
-    assert "expert hand published (2 runs) , rebuilt, approximate (1 runs)" in page
+    assert "expert hand published (2 runs) , rebuilt, approximate (1 run)" in page

@@ -205,7 +205,7 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     with pytest.raises(RunError, match="cannot write the report to 'file/x'"):
         report("runs", out=Path("file/x"))
     (tmp_path / "runs" / "a" / "config.yaml").write_text("][")
-    with pytest.raises(RunError, match="none of 1 runs can be read"):
+    with pytest.raises(RunError, match="of 1 run none can be read"):
         report("runs")
 
 

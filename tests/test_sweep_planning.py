@@ -143,7 +143,10 @@ def test_changed_settings_are_refused_with_what_differs() -> None:
         record(changed)
     message = str(caught.value)
     assert message.startswith("sweep 'mine' in '")
-    assert "(task=hammer-use1 seed=0: algo.clip: 0.2 -> 0.1; 1 more jobs differ too)" in message
+    assert (
+        "(task=hammer-use1 seed=0: algo.clip: 0.2 -> 0.1; other settings also in 1 more job)"
+        in message
+    )
     assert message.endswith("choose another sweep.name, or the settings it was planned with")
     assert (planned(()).folder / PLAN).read_bytes() == before
     with pytest.raises(SweepError, match="total_frames: 40960 -> 81920"):

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,12 +13,27 @@ import pytest
 from rich.console import Console
 
 from pgdm.cli.console.sweep_table import failures, live_table, span, summary_line
+from pgdm.cli.sweep import FRONT
+from pgdm.errors import SweepError
 from pgdm.memory import free_bytes
 from pgdm.runs.log import RunLog
+from pgdm.stop import StopRequest
+from pgdm.sweep.driver import Driver
+from pgdm.sweep.launcher import Assignment
 from pgdm.sweep.ledger import Ending, Ledger
-from pgdm.sweep.local import Room, room
+from pgdm.sweep.local import LocalLauncher, Room, room
 from pgdm.sweep.processes import Process
-from pgdm.sweep.status import PARENT, Row, log_path, parent, rows, run_ending, settle, summarize
+from pgdm.sweep.status import (
+    LOGS,
+    PARENT,
+    Row,
+    log_path,
+    parent,
+    rows,
+    run_ending,
+    settle,
+    summarize,
+)
 from sweep_plans import LOCAL, plan
 
 
@@ -206,3 +223,37 @@ def test_how_jobs_share_a_machine(
     launcher = type(LOCAL)("local", max_jobs, cores_per_job, 1.0)
     assert room(plan(tmp_path, 6, f"num_threads={threads}"), launcher, cores, memory_gb) == expected
     assert 1e7 < free_bytes() < 1e13
+
+
+def test_a_worker_that_exits_with_0_before_its_run_is_finished_has_failed(tmp_path: Path) -> None:
+    whole, heard = plan(tmp_path, 1), []
+    (tmp_path / LOGS).mkdir()
+    launcher = LocalLauncher(whole, LOCAL, ("true",))
+    front = dataclasses.replace(FRONT, notify=heard.append)
+    assert Driver(whole, 1, launcher, front).run(StopRequest()) == 1
+    (attempt,) = Ledger(tmp_path).attempts()
+    error = "exited with code 0, but its run is unfinished: 0 of 32 frames"
+    assert (attempt.state, attempt.exit_code, attempt.error) == ("failed", 0, error)
+    assert heard[0] == f"seed=0: attempt 1 failed: {error}"
+
+
+def test_if_one_worker_cannot_be_started_none_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, begun = plan(tmp_path, 2), []
+
+    class Begun(subprocess.Popen[bytes]):
+        def __init__(self, *args: object, **kwargs: object) -> None:
+            super().__init__(*args, **kwargs)  # type: ignore[call-overload]
+            begun.append(self)
+
+    launcher = LocalLauncher(whole, LOCAL, (sys.executable, "-c", "import time; time.sleep(60)"))
+    log_path(tmp_path, "seed=1", 1).mkdir(parents=True)  # where its log would be
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, "Popen", Begun)
+        with pytest.raises(
+            SweepError, match=r"cannot start the worker of seed=1, .*1\.1\.log: Is a"
+        ):
+            launcher.start([Assignment(job, 1) for job in whole.jobs])
+    assert [process.poll() for process in begun] == [-signal.SIGKILL]
+    launcher.end(0.0)  # knows of none

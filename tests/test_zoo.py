@@ -94,7 +94,7 @@ def test_filling_again_adds_what_is_new(made: Path, zoo: Path) -> None:
 
 def test_list_show_and_get(zoo: Path, tmp_path: Path) -> None:
     outcome = command("pgdm", "zoo", "list")
-    assert outcome.code == 0 and f"1 policies in {zoo}" in outcome.out
+    assert outcome.code == 0 and f"1 policy in {zoo}" in outcome.out
     assert "float16" not in outcome.out and TASK in outcome.out
     shown = yaml.safe_load(command("pgdm", "zoo", "show", TASK).out)
     assert shown["task"] == TASK and shown["settings"]["algo"]["learner"] == "sac"
@@ -134,7 +134,7 @@ def address(zoo: Path) -> Iterator[str]:
 def test_a_zoo_at_an_address(zoo: Path, address: str) -> None:
     assert Zoo(address).content(TASK) == (zoo / FILE).read_bytes()
     outcome = command("pgdm", "zoo", "list", "--from", address)
-    assert outcome.code == 0 and f"1 policies in {address}" in outcome.out
+    assert outcome.code == 0 and f"1 policy in {address}" in outcome.out
     (zoo / FILE).unlink()
     with pytest.raises(ZooError, match=f"cannot read {address}{FILE}: 404 File not found"):
         Zoo(address).content(TASK)

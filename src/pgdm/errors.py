@@ -49,6 +49,17 @@ class UnknownNameError(ConfigError):
         self.name, self.valid = name, names
 
 
+def amount(count: int, noun: str, plural: str = "") -> str:
+    """Return a count with its noun, such as ``1 joint`` and ``2 joints``.
+
+    Args:
+        count: how many.
+        noun: the noun in the singular.
+        plural: its plural; by default with an s.
+    """
+    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
+
+
 def check_at_least(key: str, value: float, low: float) -> None:
     """Check a numeric setting.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -77,7 +77,11 @@ def make_torchrl(task: str, *, num_envs: int = 64, **kwargs: Any) -> PgdmTorchRL
     """Return N simulations of a task as a TorchRL EnvBase.
 
     Arguments as `make_batch`, without ``auto_reset``: TorchRL requests resets itself.
+
+    Raises:
+        ConfigError: also if ``auto_reset`` is given.
     """
+    _check_absent("make_torchrl", ("auto_reset",), kwargs, "TorchRL requests resets itself")
     check_interpreter()
     from pgdm.envs.torchrl import PgdmTorchRLEnv
 
@@ -90,8 +94,13 @@ def make_sb3(task: str, *, num_envs: int = 64, **kwargs: Any) -> PgdmVecEnv:
     Arguments as `make_batch`; ``auto_reset`` must stay True.
 
     Raises:
-        ConfigError: also if Stable-Baselines3 is not installed.
+        ConfigError: also if ``auto_reset`` is not True, or Stable-Baselines3 is not installed.
     """
+    if (auto_reset := kwargs.get("auto_reset", True)) is not True:
+        raise ConfigError(
+            f"make_sb3: auto_reset is {auto_reset!r}; it must be True, because "
+            "Stable-Baselines3 expects ended episodes to restart by themselves"
+        )
     if find_spec("stable_baselines3") is None:
         raise ConfigError(
             "make_sb3 needs Stable-Baselines3: pip install -c constraints.txt -e '.[sb3]'"
@@ -106,11 +115,28 @@ def make_gym(task: str, *, render_mode: str | None = None, **kwargs: Any) -> Pgd
 
     Arguments as `make_batch`, without ``num_envs``, ``num_threads`` and ``auto_reset``. This is
     what ``gymnasium.make("pgdm/<task>-v0", ...)`` calls.
+
+    Raises:
+        ConfigError: also if one of these three is given.
     """
+    fixed = ("num_envs", "num_threads", "auto_reset")
+    reason = "a Gymnasium env is one simulation, which its user resets"
+    _check_absent("make_gym", fixed, kwargs, reason)
     from pgdm.envs.gym import PgdmEnv
 
     batch = make_batch(task, num_envs=1, num_threads=1, auto_reset=False, **kwargs)
     return PgdmEnv(batch, render_mode)
+
+
+def _check_absent(function: str, fixed: Sequence[str], given: Collection[str], reason: str) -> None:
+    """Check that arguments which a function passes to `make_batch` itself were not given.
+
+    Raises:
+        ConfigError: if one was given; the message ends with the reason.
+    """
+    for name in fixed:
+        if name in given:
+            raise ConfigError(f"{function} has no argument '{name}'; leave it out: {reason}")
 
 
 def register() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import re
 from collections.abc import Iterator
@@ -119,6 +120,12 @@ def inside(folder: Path, *names: str, kind: str = "name", suffix: str = "") -> P
     for name in names:
         check_path_part(kind, name)
     return folder.joinpath(*names[:-1], names[-1] + suffix)
+
+
+def unused(folder: Path, stem: str, suffix: str = "") -> Path:
+    """Return the first of ``STEM-1``, ``STEM-2``, ... in a folder that does not exist yet."""
+    numbered = (folder / f"{stem}-{i}{suffix}" for i in itertools.count(1))
+    return next(path for path in numbered if not path.exists())
 
 
 def leaves(path: Path, folder: Path) -> bool:

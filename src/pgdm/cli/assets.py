@@ -11,9 +11,9 @@ from rich.table import Table
 
 from pgdm import paths
 from pgdm.cli.console.screen import bars, confirmed, tables
-from pgdm.errors import check_name
+from pgdm.errors import amount, check_name
 from pgdm.library import open_library, staging
-from pgdm.library.catalog import CURE
+from pgdm.library.catalog import CURE, file_cure
 from pgdm.library.checks.verify import damaged
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def fetch(
         report = fetch_registry(paths.library(), offline, progress, rebuilt=experts)
     _print(report)
     index = open_library().experts()
-    print(f"{len(index.experts)} tasks have an expert hand trajectory")
+    print(f"{amount(len(index.experts), 'task')} with an expert hand trajectory")
     for task, reason in index.left_out.items():
         print(f"no expert hand trajectory: {task}: {reason}")
 
@@ -136,7 +136,8 @@ def list_tasks() -> None:
             ", ".join(entry.starts), _expert_kind(experts.get(task)),
         )  # fmt: skip
     table.caption = (
-        f"{len(served)} tasks in {paths.library()}; a task is read from the first of its sources\n"
+        f"{amount(len(served), 'task')} in {paths.library()}; a task is read from the first of "
+        "its sources\n"
         "expert: whether a human hand trajectory is stored; 'pgdm assets show TASK' prints details"
     )
     tables().print(table)
@@ -161,14 +162,15 @@ def verify() -> None:
     for line in found:
         print(line)
     if found:
-        print(
-            f"error: {len(found)} of {files} files are damaged; run 'pgdm assets fetch' or "
-            "'pgdm assets import PATH' again",
-            file=sys.stderr,
-        )
+        cures = dict.fromkeys(file_cure(line.partition("/")[0]) for line in found)
+        print(f"error: damaged files: {len(found)} of {files}. {' '.join(cures)}", file=sys.stderr)
         raise typer.Exit(1)
     count = len(library.experts().experts)
-    also = f" and {count} expert hand trajectories" if count else ""
+    also = (
+        f" and {amount(count, 'expert hand trajectory', 'expert hand trajectories')}"
+        if count
+        else ""
+    )
     print(f"{files} files of {', '.join(library.sources())}{also} are sound")
 
 
@@ -195,7 +197,7 @@ def _expert_kind(entry: ExpertEntry | None) -> str:
 
 
 def _print(report: ImportSummary) -> None:
-    print(f"{len(report.tasks)} tasks are in the library from this source")
+    print(f"the library has {amount(len(report.tasks), 'task')} from this source")
     for defect in report.defects:
         print(f"defect in the source: {defect}")
     for name, reason in report.left_out.items():

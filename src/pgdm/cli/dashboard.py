@@ -22,7 +22,7 @@ import typer
 
 from pgdm import paths
 from pgdm.cli.console.screen import bars, notify
-from pgdm.cli.options import Runs
+from pgdm.cli.options import Port, Runs
 from pgdm.errors import RunError, TrackingError
 from pgdm.runs.folder import ARTIFACTS, find_runs
 from pgdm.tracking.address import chosen
@@ -47,7 +47,7 @@ _STOPPERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 def dashboard(
     root: Runs = None,
-    port: Annotated[int, typer.Option(help="Port; if it is taken, another is used.")] = 5000,
+    port: Port = 5000,
     uri: Annotated[
         str | None,
         typer.Option(
@@ -67,7 +67,7 @@ def dashboard(
         return
     _ensure_store(address, root)
     free = free_port(port)
-    if free != port:
+    if port not in (0, free):
         print(f"port {port} is taken, using {free}")
     with tempfile.TemporaryFile() as output, _served(_command(address, root, free), output) as ui:
         url = f"http://{HOST}:{free}"
@@ -84,7 +84,7 @@ def free_port(wanted: int) -> int:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 probe.bind((HOST, port))
-            except (OSError, OverflowError):
+            except OSError:
                 continue
             return probe.getsockname()[1]
     raise TrackingError(f"no port is free on {HOST}")

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from pgdm import paths
 from pgdm.cli.console.screen import bars, tables
-from pgdm.errors import PgdmError
+from pgdm.errors import PgdmError, amount
 from pgdm.library import open_library
 from pgdm.library.catalog import CURE
 from pgdm.memory import free_bytes
@@ -79,7 +79,7 @@ def _machine() -> Iterator[Check]:
 
     bfloat16 = "with" if has_bfloat16("cpu") else "without"
     cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count()
-    yield Check("processor", True, f"{cores} cores, {bfloat16} bfloat16")
+    yield Check("processor", True, f"{amount(cores or 1, 'core')}, {bfloat16} bfloat16")
     free = free_bytes() / 1e9
     cure = f"only {free:.1f} GB are free, a run needs about {ENOUGH_GB}: close other programs"
     enough = free >= ENOUGH_GB
@@ -104,7 +104,7 @@ def _library() -> Iterator[Check]:
     except PgdmError as error:
         yield Check("library", False, str(error))
         return
-    counts = ", ".join(f"{s} {len(m.tasks)} tasks" for s, m in library.sources().items())
+    counts = ", ".join(f"{s} {amount(len(m.tasks), 'task')}" for s, m in library.sources().items())
     where = f"{counts or f'empty; runs fetch what they need. {CURE}'} ({library.root})"
     yield Check("library", True, where)
 

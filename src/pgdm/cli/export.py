@@ -9,7 +9,7 @@ from pgdm import files
 from pgdm.cli.console.screen import bars, notify
 from pgdm.cli.policies import PolicyRequest, open_policy
 from pgdm.envs.build import EnvBuilder
-from pgdm.errors import ConfigError
+from pgdm.errors import ConfigError, amount
 from pgdm.export.extras import check_installed
 from pgdm.export.scene import write_scene
 from pgdm.export.trained import TrainedPolicy
@@ -126,6 +126,6 @@ def _episodes(
     name = write_episodes(policy, builder, wanted, folder, progress, stop)
     if name is None:
         return stop.exit_code
-    print(f"dataset: {folder / name} ({request.episodes} episodes)")
+    print(f"dataset: {folder / name} ({amount(request.episodes, 'episode')})")
     print(f"to load: MINARI_DATASETS_PATH={folder.absolute()} and minari.load_dataset('{name}')")
     return 0

@@ -9,7 +9,7 @@ from pathlib import Path
 from pgdm.config.describe import Description, describe
 from pgdm.config.groups import available, conf_dir, groups
 from pgdm.config.suites import suite, suites
-from pgdm.errors import ConfigError
+from pgdm.errors import ConfigError, amount
 from pgdm.files import reason
 from pgdm.sweep.studies import studies
 
@@ -97,7 +97,7 @@ def _title(file: Path) -> str:
 
 def _suite(name: str, file: Path, config_dir: str | None, width: int) -> str:
     try:
-        text = f"{len(suite(name, config_dir))} tasks: {_title(file)}"
+        text = f"{amount(len(suite(name, config_dir)), 'task')}: {_title(file)}"
     except ConfigError as error:
         text = f"cannot be read: {error} ({file})"
     return _entry(name, text.split(), width, 17)

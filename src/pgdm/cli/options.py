@@ -107,6 +107,12 @@ def _ending(suffix: str, kind: str) -> Callable[[typer.CallbackParam, Path | Non
     return check
 
 
+def _known_port(port: int) -> int:
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"--port {port} is no port: give 1 to 65535, or 0 for any free one")
+    return port
+
+
 def complete_task(incomplete: str) -> list[str]:
     """Return the tasks that begin with the typed text, for shell completion."""
     return [name for name in available("task") if name.startswith(incomplete)]
@@ -217,5 +223,9 @@ ZipStatistics = Annotated[
 ]
 Offline = Annotated[
     bool, typer.Option("--offline", help="Never download assets; use earlier downloads.")
+]
+Port = Annotated[
+    int,
+    typer.Option(help="Port; 0, or one that is taken: a free port is used.", callback=_known_port),
 ]
 Runs = Annotated[Path | None, typer.Argument(metavar="DIR", help="Folder of runs [runs].")]

@@ -13,6 +13,7 @@ from pgdm.cli.jobs import Asked
 from pgdm.cli.sweep import FRONT
 from pgdm.config.groups import GROUPS
 from pgdm.config.strict import build
+from pgdm.errors import amount
 from pgdm.library import open_library
 from pgdm.runs.config_file import dotted
 from pgdm.sweep.estimate import Estimate, estimate
@@ -78,7 +79,7 @@ def _rows(plan: Plan, cost: Estimate) -> list[tuple[str, str]]:
     lengths = " or ".join(f"{n:,}" for n in sorted({cfg.total_frames for cfg in cfgs}))
     speed = f"{cost.steps_per_s:,.0f} steps/s"
     source = (
-        f"{speed}, measured in {cost.measured_runs} earlier runs"
+        f"{speed}, measured in {amount(cost.measured_runs, 'earlier run')}"
         if cost.measured_runs
         else f"{speed}, which is assumed: there is no earlier run like these"
     )

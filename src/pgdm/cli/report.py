@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pgdm.cli.console.screen import bars, notify
+from pgdm.errors import amount
 from pgdm.report.source import check_place
 from pgdm.tracking.address import chosen
 
@@ -22,4 +23,4 @@ def make_report(places: list[str], out: Path | None, uri: str | None) -> None:
     with bars(patience_s=2.0) as progress:
         page, results = write_report(places, folder, progress, store)
     states = ", ".join(f"{count} {state}" for state, count in results.counts().items())
-    print(f"{len(results.runs)} runs ({states}): {page}")
+    print(f"{amount(len(results.runs), 'run')} ({states}): {page}")

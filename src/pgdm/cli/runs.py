@@ -21,7 +21,7 @@ from typer.core import TyperGroup
 from pgdm import paths
 from pgdm.cli.console.screen import bars, confirmed, fits, tables
 from pgdm.cli.options import Runs
-from pgdm.errors import ConfigError, RunError, UnknownNameError
+from pgdm.errors import ConfigError, RunError, UnknownNameError, amount
 from pgdm.runs.folder import RunFolder, claimed, find_runs, folder_of, located
 from pgdm.runs.log import metrics_of
 
@@ -118,7 +118,7 @@ def list_runs(
     elif rows:
         _print(rows)
     elif found:
-        print(f"none of the {found} runs in {root} has {', '.join(where or ())}")
+        print(f"of {amount(found, 'run')} in {root} none has {', '.join(where or ())}")
     else:
         print(f"no runs in {root}; `pgdm-run` starts one")
 

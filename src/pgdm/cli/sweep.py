@@ -21,7 +21,7 @@ from pgdm.cli import worker
 from pgdm.cli.console.errors import INTERRUPTED as INTERRUPTED_CODE
 from pgdm.cli.console.screen import notify, tables
 from pgdm.cli.console.sweep_table import SweepView, percent, span, summary_line
-from pgdm.errors import SweepError, UnknownNameError
+from pgdm.errors import SweepError, UnknownNameError, amount
 from pgdm.sweep.front import Front
 from pgdm.sweep.ledger import (
     CANCELLED,
@@ -161,7 +161,7 @@ def cancel(folder: Folder, jobs: Jobs = None) -> None:
         if time.monotonic() > limit:
             raise SweepError(f"not all jobs have stopped yet; see pgdm sweep status {folder}")
         time.sleep(_POLL_S)
-    print(f"cancelled {len(chosen)} jobs; pgdm sweep resume {folder} resumes them")
+    print(f"cancelled {amount(len(chosen), 'job')}; to resume: pgdm sweep resume {folder}")
 
 
 @app.command()
@@ -182,7 +182,7 @@ def retry(folder: Folder, jobs: Jobs = None) -> None:
         return
     if parent(ledger) is not None:
         ledger.set_states({entry.key: WAITING for entry in chosen})
-        print(f"{len(chosen)} jobs will be retried by the running sweep")
+        print(f"{amount(len(chosen), 'job')} will be retried by the running sweep")
         return
     raise typer.Exit(_resume(folder, keys={entry.key for entry in chosen}))
 

@@ -9,6 +9,7 @@ from rich.table import Table
 from pgdm.cli.console.screen import tables
 from pgdm.config.describe import describe
 from pgdm.config.groups import available, folders, unreadable
+from pgdm.errors import amount
 from pgdm.files import reason
 from pgdm.library import animated, open_library, staging
 
@@ -36,7 +37,8 @@ def print_tasks(tcdm30: bool) -> None:
         print(f"unreadable: {file}: {why}; correct or remove it")
     missing = sum(row[0] not in sources for row in rows)
     if missing:
-        print(f"{missing} of {len(rows)} tasks are not in the asset library: pgdm assets --help")
+        count = f"{missing} of {amount(len(rows), 'task')}"
+        print(f"not in the asset library (pgdm assets --help): {count}")
 
 
 def _cells(name: str, file: Path) -> list[str]:

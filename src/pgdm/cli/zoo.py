@@ -10,7 +10,7 @@ import typer
 
 from pgdm.cli.console.screen import loading, tables
 from pgdm.cli.options import Offline
-from pgdm.errors import ConfigError, check_name
+from pgdm.errors import ConfigError, amount, check_name
 
 app = typer.Typer(
     name="zoo",
@@ -59,7 +59,7 @@ def list_policies(place: Place = None) -> None:
         )
     tables().print(table)
     total = sum(entry.bytes for entry in zoo.entries.values())
-    print(f"{len(zoo.entries)} policies in {zoo.place}, {total / 1e6:.1f} MB")
+    print(f"{amount(len(zoo.entries), 'policy', 'policies')} in {zoo.place}, {total / 1e6:.1f} MB")
 
 
 @app.command()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Annotated
 
 from pgdm.config.ranges import check_ranges
 from pgdm.config.strict import ChosenBy
-from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.errors import ConfigError, UnknownNameError, amount
 from pgdm.library.files import expert as expert_file
 from pgdm.library.tasks import MOCAP_TASKS
 from pgdm.mdp.actions import KINDS, WRIST_PATHS, ActionCfg
@@ -105,8 +106,8 @@ class ExperimentCfg:
         self._check_hand()
         self._check_expert()
         self._check_placements()
-        if self.device.partition(":")[0] not in ("cpu", "cuda"):
-            raise UnknownNameError("device", self.device, ("cpu", "cuda"))
+        if not re.fullmatch("cpu|cuda(:[0-9]+)?", self.device):
+            raise UnknownNameError("device", self.device, ("cpu", "cuda", "cuda:N"))
         if not self.run_dir.strip():
             raise ConfigError("run_dir is empty; name a folder, or null for the default")
         if not self.budget.strip():
@@ -130,8 +131,8 @@ class ExperimentCfg:
         wrong = [i for i in hand.fingertips if not 0 <= i < len(hand.points)]
         if wrong:
             raise ConfigError(
-                f"hand.fingertips has {wrong[0]}, but hand.points has {len(hand.points)} entries: "
-                f"use 0 to {len(hand.points) - 1}"
+                f"hand.fingertips has {wrong[0]}, but hand.points has "
+                f"{amount(len(hand.points), 'entry', 'entries')}: use 0 to {len(hand.points) - 1}"
             )
 
     def _check_expert(self) -> None:
@@ -162,7 +163,8 @@ class ExperimentCfg:
                 value = getattr(placement, name)
                 if value is not None and len(value) != size:
                     raise ConfigError(
-                        f"task.placements[{i}].{name} has {len(value)} numbers, not {size}"
+                        f"task.placements[{i}].{name} has "
+                        f"{amount(len(value), 'number')}, not {size}"
                     )
             if placement.quat is not None and sum(q * q for q in placement.quat) == 0:
                 raise ConfigError(
@@ -199,7 +201,7 @@ def check_device(device: str) -> None:
     """Check that this machine has the device. Stored runs can be read without it.
 
     Raises:
-        ConfigError: if the machine lacks it.
+        ConfigError: if the machine lacks it; the message names the GPUs that it has.
     """
     if device.startswith("cuda"):
         # Imported only here: looking for a GPU takes time, and most runs use none.
@@ -207,3 +209,8 @@ def check_device(device: str) -> None:
 
         if not torch.cuda.is_available():
             raise ConfigError(f"device is {device}, but torch finds no GPU here; use device=cpu")
+        have = [f"cuda:{i}" for i in range(torch.cuda.device_count())]
+        if device not in ("cuda", *have):
+            raise ConfigError(
+                f"device is {device}, which torch does not find here; valid: {', '.join(have)}"
+            )

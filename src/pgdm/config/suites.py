@@ -10,7 +10,7 @@ from typing import Any
 
 from pgdm import files
 from pgdm.config.groups import available, folders
-from pgdm.errors import ConfigError, UnknownNameError
+from pgdm.errors import ConfigError, UnknownNameError, amount
 
 _log = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ def unknown_task(name: str, config_dir: str | Path | None) -> ConfigError:
     if name in suites(config_dir):
         size = len(suite(name, config_dir))
         return ConfigError(
-            f"{name} is a suite of {size} tasks; to run them all: pgdm-run -m task={name}"
+            f"{name} is a suite of {amount(size, 'task')}; to run them all: pgdm-run -m task={name}"
         )
     if "*" in name:
         return ConfigError(

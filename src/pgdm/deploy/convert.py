@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ from pgdm.deploy.limits import CONTROL_HZ, JOINTS, Usage, usage
 from pgdm.deploy.names import REACHED, check_base
 from pgdm.deploy.playback import Playback
 from pgdm.deploy.rollout import Rollout
-from pgdm.errors import check_above_zero
+from pgdm.errors import ConfigError, check_above_zero, check_at_least
 from pgdm.sim.scene import Scene
 
 REACH_M, REACH_RAD = 1e-3, 1e-2
@@ -44,11 +45,17 @@ class ConvertCfg:
         """Check the numbers.
 
         Raises:
-            ConfigError: if one is outside its range.
+            ConfigError: if one is outside its range, NaN or infinite.
         """
         check_base(self.base)
-        for name in ("smooth_s", "rate_hz", "speed"):
-            check_above_zero(f"--{name.partition('_')[0]}", getattr(self, name))
+        for name in ("smooth_s", "hold_s", "rate_hz", "speed"):
+            option, value = f"--{name.partition('_')[0]}", getattr(self, name)
+            if not math.isfinite(value):
+                raise ConfigError(f"{option} is {value}; it must be a finite number")
+            if name == "hold_s":
+                check_at_least(option, value, 0)
+            else:
+                check_above_zero(option, value)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from pgdm import files
 from pgdm.deploy.limits import JOINTS
 from pgdm.deploy.names import check_suffix
-from pgdm.errors import ConfigError, PgdmError
+from pgdm.errors import ConfigError, PgdmError, amount
 from pgdm.library.files import npz
 from pgdm.paths import replacing
 
@@ -160,7 +160,7 @@ def _from_csv(text: str) -> dict[str, Any]:
     rows = [line.split(",") for line in lines[3:]]
     for number, row in enumerate(rows, 4):
         if len(row) != len(names):
-            raise ValueError(f"line {number} has {len(row)} columns, not {len(names)}")
+            raise ValueError(f"line {number} has {amount(len(row), 'column')}, not {len(names)}")
     table = np.array(rows, dtype=float).reshape(len(rows), len(names))
     arrays: dict[str, Any] = {"format": FORMAT, "facts": lines[1][2:]}
     first = 0
@@ -188,7 +188,7 @@ def _checked(arrays: Mapping[str, Any]) -> Playback:
     time_s = _numbers(arrays["time_s"], "time_s", (None,))
     count = len(time_s)
     if not _FEWEST <= count <= MOST_SAMPLES:
-        raise ValueError(f"{count} samples; it needs {_FEWEST} to {MOST_SAMPLES}")
+        raise ValueError(f"{amount(count, 'sample')}; it needs {_FEWEST} to {MOST_SAMPLES}")
     if time_s[0] != 0.0:
         raise ValueError(f"time_s begins at {time_s[0]:g}, not at 0")
     steps = np.diff(time_s)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from pgdm.envs.batch_env import BatchEnv
-from pgdm.errors import RunError
+from pgdm.errors import RunError, amount
 from pgdm.rl.evaluate import Policy
 
 
@@ -67,8 +67,8 @@ def roll_out(
     whole = np.flatnonzero(alive)
     if not len(whole):
         raise RunError(
-            f"in all {env.num_envs} episodes the policy loses the object, or the simulation "
-            "diverges, before the end of the motion: there is nothing to play; train longer, or "
+            f"of {amount(env.num_envs, 'episode')} none can be played: the policy loses the "
+            "object, or the simulation diverges, before the end of the motion; train longer, or "
             "roll out more --episodes"
         )
     columns = {

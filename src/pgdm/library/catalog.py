@@ -28,6 +28,11 @@ EXPERT_CURE = "Get the expert hand trajectories with 'pgdm assets fetch'."
 _log = logging.getLogger(__name__)
 
 _CURES = {staging.OWN: manifests.OWN_CURE}
+_FILE_CURES = {
+    staging.OWN: "Create it again with 'pgdm author', or restore it from a copy.",
+    staging.ANIMATED: "Remove the library's folder 'animated'; pgdm makes it again on demand.",
+    staging.EXPERTS: EXPERT_CURE,
+}
 _NAMES = {staging.OWN: "your own objects, hands and tasks"}
 _PARTIAL = (staging.OWN, staging.ANIMATED)
 
@@ -289,7 +294,8 @@ class Library:
         path = self._folders[source] / relative
         if not path.is_file():
             raise LibraryError(
-                f"{path}: missing from the library, although its manifest lists it. {CURE}"
+                f"{path}: missing from the library, although its manifest lists it. "
+                f"{file_cure(source)}"
             )
         self._check_unchanged(source, relative)
         return path
@@ -302,12 +308,16 @@ class Library:
         for name, entry in self._sources[source].files.items():
             path = self._folders[source] / name
             if name.startswith(model) and path.is_file() and sha256_of(path) != entry.sha256:
-                own = "Create it again with 'pgdm author', or restore it from a copy."
                 raise CorruptAssetError(
                     f"{path}: was changed after it came into the library: its SHA-256 differs from "
-                    f"the recorded one. {own if source == staging.OWN else CURE}"
+                    f"the recorded one. {file_cure(source)}"
                 )
         self._unchanged.add((source, relative))
+
+
+def file_cure(source: str) -> str:
+    """Return advice for a missing or changed file of a library source."""
+    return _FILE_CURES.get(source, CURE)
 
 
 def open_library(root: Path | None = None) -> Library:

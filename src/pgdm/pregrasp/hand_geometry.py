@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from pgdm import rotations
-from pgdm.errors import ConfigError
+from pgdm.errors import ConfigError, amount
 from pgdm.sim.contact import HandContact
 from pgdm.sim.scene import Scene
 
@@ -99,8 +99,8 @@ def mean_fingers(scene: Scene) -> np.ndarray:
     count = scene.index.num_joints - hand.num_base_joints - hand.num_wrist_joints
     if len(hand.mean_fingers_rad) != count:
         raise ConfigError(
-            f"hand.mean_fingers_rad has {len(hand.mean_fingers_rad)} numbers, but hand "
-            f"'{hand.name}' has {count} finger joints after hand.num_base_joints and "
+            f"hand.mean_fingers_rad has {amount(len(hand.mean_fingers_rad), 'number')}, but hand "
+            f"'{hand.name}' has {amount(count, 'finger joint')} after hand.num_base_joints and "
             "hand.num_wrist_joints"
         )
     return np.array(hand.mean_fingers_rad)

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from pgdm.errors import amount
 from pgdm.report.curves import mean_curve, mean_line
 from pgdm.report.figures import NAMES, axis_end, colour, few_ticks, pairs, shades, wrapped
 from pgdm.report.results import Array, Results
@@ -62,7 +63,7 @@ def compared(results: Results, rows: Sequence[Average]) -> Figure | None:
                 for row, found in zip(own, runs, strict=True)
             ]
             kind = "shared task" if len(own) > 1 else "task"
-            panels[_title(group, f"mean of {_count(tasks, kind)}")] = lines
+            panels[_title(group, f"mean of {amount(len(tasks), kind)}")] = lines
     return _drawn(panels)
 
 
@@ -89,7 +90,8 @@ def validated(results: Results, rows: Sequence[Average]) -> Figure | None:
         seen = f"; thin: {len(whole)} of {len(seeds)} seeds" if whole else ""
         if tasks:
             mean = Line("", tasks, {"color": shade, "lw": 1.8})
-            panels[_title(row.group, f"mean of {_count(tasks)}{seen}")] = [*lines, mean]
+            text = f"mean of {amount(len(tasks), 'task')}{seen}"
+            panels[_title(row.group, text)] = [*lines, mean]
     return _drawn(panels)
 
 
@@ -118,10 +120,6 @@ def _shared(each: Sequence[Collection[str]]) -> list[str]:
 
 def _style(row: Average, shade: Any) -> dict[str, Any]:
     return {"color": shade, "lw": 1.8, "ls": "-" if row.setting.with_pregrasp else "--"}
-
-
-def _count(tasks: Sequence[Any], kind: str = "task") -> str:
-    return f"{len(tasks)} {kind}{'s' if len(tasks) > 1 else ''}"
 
 
 def _title(group: str, text: str) -> str:

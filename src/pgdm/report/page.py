@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from pgdm.config.compose import PAPER_FRAMES
-from pgdm.errors import RunError
+from pgdm.errors import RunError, amount
 from pgdm.library.progress import StepProgress, counted
 from pgdm.report import alike, export, figures, mean_curves, tables
 from pgdm.report.curves import curves
@@ -53,7 +53,9 @@ def write_report(
     found = find(places, uri, out, progress)
     if not found.runs:
         folder, reason = next(iter(found.unreadable.items()))
-        raise RunError(f"none of {len(found.unreadable)} runs can be read; {folder}: {reason}")
+        raise RunError(
+            f"of {amount(len(found.unreadable), 'run')} none can be read; {folder}: {reason}"
+        )
     results = Results(found.runs)
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from pgdm.errors import amount
 from pgdm.report.runs import STATES, SUCCESS, Run
 from pgdm.report.settings import Setting, labels
 
@@ -91,7 +92,8 @@ class Results:
         found = setting.deviations(*groups)
         wanted = setting.option("pregrasp")
         starts = Counter(r.start for r in self.runs if r.setting == setting and r.start != wanted)
-        return found + [f"start {start}, not {wanted}: {n} runs" for start, n in starts.items()]
+        other = [f"start {start}, not {wanted}: {amount(n, 'run')}" for start, n in starts.items()]
+        return found + other
 
     def counts(self) -> dict[str, int]:
         """Return how many runs are in each state."""

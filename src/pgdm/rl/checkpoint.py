@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from pgdm import files
-from pgdm.errors import CheckpointError
+from pgdm.errors import CheckpointError, amount
 from pgdm.paths import TEMPORARY, replacing
 
 _MAGIC = b"pgdm-checkpoint-1"
@@ -116,8 +116,8 @@ class CheckpointFolder:
             return path, state
         if paths:
             raise CheckpointError(
-                f"none of the {len(paths)} checkpoints in {self.folder} can be used ({reason}); "
-                "start anew in another run_dir"
+                f"of {amount(len(paths), 'checkpoint')} in {self.folder} none can be used "
+                f"({reason}); start anew in another run_dir"
             )
         return None
 

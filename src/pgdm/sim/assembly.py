@@ -107,8 +107,8 @@ def load(file: Path) -> mujoco.MjSpec:
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise SceneError(
-            f"{file} is damaged ({reason}); 'pgdm assets verify' lists all damaged files, "
-            "'pgdm assets fetch' or 'pgdm assets import PATH' replaces them"
+            f"{file} is damaged ({reason}); 'pgdm assets verify' lists all damaged files, and how "
+            "to replace them"
         ) from error
 
 

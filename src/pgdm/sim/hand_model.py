@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from pgdm.errors import SceneError
+from pgdm.errors import SceneError, amount
 from pgdm.library.couplings import Couplings
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def _check_joints(model: mujoco.MjModel, hand: HandCfg) -> int:
     if count < hand.num_base_joints + hand.num_wrist_joints:
         raise _wrong(
             hand,
-            f"there are {count} joints '{prefix}...', fewer than hand.num_base_joints "
+            f"it has {amount(count, 'joint')} '{prefix}...', fewer than hand.num_base_joints "
             f"{hand.num_base_joints} plus hand.num_wrist_joints {hand.num_wrist_joints}; the "
             f"prefix is the model's name (<mujoco model=...>), which must be '{hand.name}'",
         )

@@ -218,7 +218,7 @@ class Driver:
             job, key = worker.assignment.job, worker.assignment.job.key
             ending = self._ending(worker, ended)
             self._ledger.end(*worker.assignment.id, ending)
-            if ended.code != 0:
+            if ended.code != 0 or ending.state != FINISHED:
                 self._mirror.correct(Path(job.cfg.run_dir))
             if ended.displaced and (ending.frames or 0) > worker.frames:
                 self._tries[key] -= 1
@@ -241,8 +241,10 @@ class Driver:
         elif ended.error is not None:
             state = INTERRUPTED if worker.asked or ended.displaced else FAILED
             error = ended.error
-        elif code in STOPPED or code == 0:
+        elif code in STOPPED:
             state, error = INTERRUPTED, "stopped by a signal"
+        elif code == 0:
+            state, error = FAILED, f"exited with code 0, but its run {_left(job, found)}"
         else:
             log = log_path(self._plan.folder, job.name, worker.assignment.number)
             state, error = FAILED, _last_error(log)
@@ -267,6 +269,13 @@ class Driver:
 def _frames(job: Job) -> int:
     """Return the number of frames that a job's run has completed."""
     return job_ending(job).frames or 0
+
+
+def _left(job: Job, found: Ending) -> str:
+    """Return why a job's run does not count as finished, in words that follow "its run"."""
+    if found.state == FINISHED:
+        return f"folder {job.cfg.run_dir} holds another run"
+    return f"is unfinished: {found.frames or 0:,} of {job.cfg.total_frames:,} frames"
 
 
 def _last_error(log: Path) -> str:

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from pgdm.config.schema import ExperimentCfg
+from pgdm.errors import amount
 from pgdm.library import Library
 from pgdm.library.progress import StepProgress, silent
 from pgdm.library.tasks import CHECKOUT_TASKS, REBUILT_EXPERTS
@@ -48,14 +49,14 @@ def foresee(
             if used_by[start] != source:
                 replaced[source, used_by[start]] += 1
     found = [
-        f"{count} runs with pregrasp={source} start from '{used}', since no '{source}' start is "
-        "stored here for their tasks (a TCDM checkout has it, or 'pgdm pregrasp reach TASK' "
+        f"pregrasp={source}: {amount(count, 'run')} will start from '{used}', since no '{source}' "
+        "start of the task is stored here (a TCDM checkout has it, or 'pgdm pregrasp reach TASK' "
         "plans it)"
         for (source, used), count in replaced.items()
     ]
     if planned:
         found.append(
-            f"{len(planned)} tasks need a wrist plan; a run whose plan the library lacks "
+            f"{amount(len(planned), 'task')} with a wrist plan; a run whose plan the library lacks "
             "computes it first, which takes 10-40 s"
         )
     if lacking:

@@ -9,7 +9,10 @@ import subprocess
 import time
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
+from pathlib import Path
 
+from pgdm import files
+from pgdm.errors import SweepError
 from pgdm.memory import free_bytes
 from pgdm.sweep.launcher import Assignment, Ended
 from pgdm.sweep.ledger import Attempt
@@ -70,24 +73,33 @@ class LocalLauncher:
         return self.slots - working
 
     def start(self, assignments: Sequence[Assignment]) -> None:
-        """Start a process for each assignment."""
-        for assignment in assignments:
-            place = [
-                str(self._folder),
-                assignment.job.key,
-                str(assignment.number),
-                str(self._threads),
-            ]
-            with open(
-                log_path(self._folder, assignment.job.name, assignment.number), "wb"
-            ) as output:
-                self._processes[assignment.id] = subprocess.Popen(
-                    [*self._worker, *place],
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=subprocess.STDOUT,
-                    start_new_session=True,  # Ctrl-C reaches only the driver, which stops workers
-                )
+        """Start a process for each assignment, or none.
+
+        Raises:
+            SweepError: if one cannot be started; those started before it are killed.
+        """
+        for i, assignment in enumerate(assignments):
+            log = log_path(self._folder, assignment.job.name, assignment.number)
+            try:
+                self._processes[assignment.id] = self._begin(assignment, log)
+            except OSError as error:
+                for other in assignments[:i]:  # they have only just begun: nothing is lost
+                    _kill(self._processes.pop(other.id))
+                raise SweepError(
+                    f"cannot start the worker of {assignment.job.name}, whose log is {log}: "
+                    f"{files.reason(error)}"
+                ) from error
+
+    def _begin(self, assignment: Assignment, log: Path) -> subprocess.Popen[bytes]:
+        place = [str(self._folder), *map(str, assignment.id), str(self._threads)]
+        with open(log, "wb") as output:
+            return subprocess.Popen(
+                [*self._worker, *place],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C reaches only the driver, which stops workers
+            )
 
     def adopt(self, assignment: Assignment, attempt: Attempt) -> bool:
         """Return False: only the parent of a process learns how it exits."""
@@ -121,6 +133,11 @@ class LocalLauncher:
             try:
                 process.wait(max(limit - time.monotonic(), 0))
             except subprocess.TimeoutExpired:
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+                _kill(process)
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """Kill a worker with its children, and wait until it is gone."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()

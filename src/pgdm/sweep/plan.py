@@ -16,7 +16,14 @@ from pgdm.config.foreign import check_method
 from pgdm.config.identity import difference, identity, with_added_keys
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.strict import build
-from pgdm.errors import ConfigError, SweepError, check_above_zero, check_at_least, check_name
+from pgdm.errors import (
+    ConfigError,
+    SweepError,
+    amount,
+    check_above_zero,
+    check_at_least,
+    check_name,
+)
 from pgdm.runs.files import write_json
 from pgdm.sweep.ledger import run_dir_in
 from pgdm.sweep.status import PLAN
@@ -189,10 +196,11 @@ def check_fits(plan: Plan) -> tuple[Job, ...]:
         (old, new), others = changed[0], len(changed) - 1
         whole = [("total_frames", old.cfg.total_frames, new.cfg.total_frames)]
         changes = difference(old.cfg, new.cfg) + [f"{k}: {a} -> {b}" for k, a, b in whole if a != b]
+        if others:
+            changes.append(f"other settings also in {amount(others, 'more job')}")
         raise SweepError(
             f"sweep '{plan.name}' in '{plan.folder}' was planned with other settings ({new.name}: "
-            f"{'; '.join(changes)}{f'; {others} more jobs differ too' if others else ''}); choose "
-            "another sweep.name, or the settings it was planned with"
+            f"{'; '.join(changes)}); choose another sweep.name, or the settings it was planned with"
         )
     return known
 

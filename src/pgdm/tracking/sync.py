@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pgdm.errors import ConfigError, RunError, TrackingError
+from pgdm.errors import ConfigError, RunError, TrackingError, amount
 from pgdm.runs.folder import RunFolder, check_links, find_runs
 from pgdm.runs.log import metrics_of
 from pgdm.tracking.address import chosen
@@ -83,8 +83,8 @@ def sync(
         done.append(outcome)
     if failed := [one.reason for one in done if one.action == "failed"]:
         raise TrackingError(
-            f"{len(failed)} of {len(done)} runs could not be synced: {failed[0]}; pgdm runs sync "
-            "--uri URI names another store"
+            f"{len(failed)} of {amount(len(done), 'run')} could not be synced: {failed[0]}; "
+            "pgdm runs sync --uri URI names another store"
         )
     return done
 

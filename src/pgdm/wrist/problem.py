@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from pgdm.errors import ConfigError
+from pgdm.errors import ConfigError, amount
 from pgdm.motion.reference import ObjectReference
 from pgdm.sim.scene import Scene
 
@@ -51,7 +51,7 @@ class WristProblem:
         if 2 * self.hold_steps >= poses - 1:
             raise ConfigError(
                 f"action.hold_steps is {self.hold_steps}: to hold and catch up takes twice that, "
-                f"and the motion has {poses - 1} steps; use at most {(poses - 2) // 2}"
+                f"and the motion has {amount(poses - 1, 'step')}; use at most {(poses - 2) // 2}"
             )
         if poses > _LONGEST:
             raise ConfigError(

@@ -96,7 +96,7 @@ def find(model: mujoco.MjModel, chosen: Mapping[str, str], label: str) -> Anatom
     tips = [int(body) for body in np.flatnonzero(moved) if body not in inner]
     if not 3 <= len(tips) <= len(HUMAN):
         raise ConfigError(
-            f"{label}: {len(tips)} chains of joints end in a fingertip "
+            f"{label}: chains of joints that end in a fingertip: {len(tips)} "
             f"({_listed(_name(model, t) for t in tips)}); pgdm's hands have 3 to 5 fingers"
         )
     paths = [_ancestors(parents, tip) for tip in tips]

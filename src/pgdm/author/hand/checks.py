@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from pgdm.errors import SceneError
+from pgdm.errors import SceneError, amount
 from pgdm.library.tasks import SUBSTEPS
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.contact import HandContact
@@ -58,7 +58,11 @@ class Checks:
             text = "none in the reset pose"
         else:
             pairs = ", ".join(f"{one} and {two}" for one, two in self.excluded[:4])
-            more = f" and {len(self.excluded) - 4} more pairs" if len(self.excluded) > 4 else ""
+            more = (
+                f" and {amount(len(self.excluded) - 4, 'more pair')}"
+                if len(self.excluded) > 4
+                else ""
+            )
             text = f"switched off where links overlap in the reset pose: {pairs}{more}"
         if self.self_collisions:
             pairs = ", ".join(f"{one} and {two}" for one, two in self.self_collisions[:4])

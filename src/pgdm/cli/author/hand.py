@@ -8,7 +8,7 @@ from rich.table import Table
 
 from pgdm.author.hand import AuthoredHand, HandRequest, author_hand
 from pgdm.cli.console.screen import bars, console, notify
-from pgdm.errors import ConfigError, RenderError
+from pgdm.errors import ConfigError, RenderError, amount
 from pgdm.sim.hand_sheet import write_hand_sheet
 
 
@@ -81,7 +81,7 @@ def run(request: HandRequest) -> None:
 
 def _found(made: AuthoredHand) -> list[tuple[str, str]]:
     found = made.anatomy
-    fingers = ", ".join(f"{f.human} ({len(f.joints)} joints)" for f in found.fingers)
+    fingers = ", ".join(f"{f.human} ({amount(len(f.joints), 'joint')})" for f in found.fingers)
     gains = sorted({s.kp for s in made.servos.values()})
     given = sum(servo.given for servo in made.servos.values())
     reset = {

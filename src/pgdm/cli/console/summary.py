@@ -13,6 +13,7 @@ from rich.table import Table
 from pgdm.config.compose import PAPER_FRAMES, compose
 from pgdm.config.groups import GROUPS
 from pgdm.config.identity import difference
+from pgdm.errors import amount
 from pgdm.runs.config_file import dotted
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def _caption(cfg: ExperimentCfg, frames: int, start: str) -> str:
     changed = _changes(cfg)
     differs += changed[:_SHOWN_CHANGES]
     if len(changed) > _SHOWN_CHANGES:
-        differs.append(f"{len(changed) - _SHOWN_CHANGES} more settings")
+        differs.append(amount(len(changed) - _SHOWN_CHANGES, "more setting"))
     if not differs:
         return "the paper's settings; the paper's values are means of 3 seeds, this run is one seed"
     return f"budget '{cfg.budget}', not comparable with the paper's values: {', '.join(differs)}"

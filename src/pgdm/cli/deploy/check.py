@@ -10,6 +10,7 @@ import numpy as np
 from pgdm.cli.console.screen import console
 from pgdm.deploy import limits
 from pgdm.deploy.playback import Playback, read
+from pgdm.errors import amount
 
 
 def run_check(file: Path) -> int:
@@ -30,7 +31,8 @@ def describe(file: Path, playback: Playback, used: limits.Usage) -> None:
     say = partial(console().print, soft_wrap=True, markup=False, highlight=False)
     count, hand = len(playback.time_s), len(playback.hand_joints)
     task = playback.facts.get("task", "no task")
-    say(f"{file}: {task}, {playback.duration_s:.2f} s, {count} samples, {hand} hand joints")
+    parts = f"{count} samples, {amount(hand, 'hand joint')}"
+    say(f"{file}: {task}, {playback.duration_s:.2f} s, {parts}")
     room = used.share["position"]
     say(f"position: at least {room.min():.3f} rad from its limits ({_joint(-room)})")
     for name in ("velocity", "acceleration", "jerk"):

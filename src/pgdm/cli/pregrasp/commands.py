@@ -12,6 +12,7 @@ from pgdm.cli.options import (
     Hand,
     Image,
     Offline,
+    Port,
     Source,
     Task,
     Tasks,
@@ -187,10 +188,7 @@ def label(
             "exists of labeled, planned, mined, mocap and none.",
         ),
     ] = None,
-    port: Annotated[
-        int,
-        typer.Option(min=0, max=65535, help="Port; if it is taken, another is used."),
-    ] = 8090,
+    port: Port = 8090,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page, or only serve it.")
     ] = True,

@@ -18,13 +18,15 @@ from pathlib import Path
 import mujoco
 
 from pgdm import files, limited
-from pgdm.errors import ConfigError, CorruptAssetError, LimitError
+from pgdm.errors import ConfigError, CorruptAssetError, LimitError, amount
 from pgdm.library.files import mjcf
 from pgdm.library.files.model import check_stays
 
 MESHES = (".stl", ".obj", ".msh")
 """Mesh formats that MuJoCo reads."""
 MOST_JOINTS, MOST_BODIES = 60, 300
+MOST_JOINT_ELEMENTS = 8 * MOST_JOINTS
+"""Most ``<joint>`` elements of a file, among them fixed joints, defaults and references."""
 
 _SECONDS = 60  # limit of CPU time for reading and compiling
 _DEFINITIONS = re.compile(rb"<!(DOCTYPE|ENTITY)", re.IGNORECASE)
@@ -136,10 +138,10 @@ def _check_numbers(element: ET.Element, label: str) -> None:
                 raise CorruptAssetError(f'{label}: <{item.tag}>{name} has {key}="{value}"')
     joints = sum(item.tag == "joint" for item in element.iter())
     bodies = sum(item.tag in ("body", "link") for item in element.iter())
-    if joints > 8 * MOST_JOINTS or bodies > MOST_BODIES:
+    if joints > MOST_JOINT_ELEMENTS or bodies > MOST_BODIES:
         raise CorruptAssetError(
-            f"{label}: {bodies} bodies and {joints} joints; a hand has at most {MOST_BODIES} and "
-            f"{MOST_JOINTS}"
+            f"{label}: has {amount(bodies, 'body', 'bodies')} and {joints} <joint> elements; a "
+            f"hand's file has at most {MOST_BODIES} and {MOST_JOINT_ELEMENTS}"
         )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from pgdm.errors import ConfigError, CorruptAssetError
+from pgdm.errors import ConfigError, CorruptAssetError, amount
 
 SUFFIXES = (".stl", ".obj", ".ply", ".glb", ".off")
 """Supported formats."""
@@ -141,17 +141,17 @@ def _clean(mesh: trimesh.Trimesh, label: str, repairs: list[str]) -> None:
     before = len(mesh.vertices)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if merged := before - len(mesh.vertices):
-        repairs.append(f"merged {merged} vertices at the same place")
+        repairs.append(f"merged {amount(merged, 'vertex', 'vertices')} at the same place")
     # Relative to the mesh's size: trimesh's absolute bound would drop faces of fine scans.
     sound = mesh.area_faces > 1e-12 * mesh.scale**2
     if not sound.any():
-        raise CorruptAssetError(f"{label}: all of its {len(sound)} faces have zero area")
+        raise CorruptAssetError(f"{label}: all its faces have zero area: {len(sound)}")
     if not sound.all():
-        repairs.append(f"removed {int((~sound).sum())} faces of zero area")
+        repairs.append(f"removed {amount(int((~sound).sum()), 'face')} of zero area")
         mesh.update_faces(sound)
     unique = mesh.unique_faces()
     if not unique.all():
-        repairs.append(f"removed {int((~unique).sum())} duplicate faces")
+        repairs.append(f"removed {amount(int((~unique).sum()), 'duplicate face')}")
         mesh.update_faces(unique)
     mesh.remove_unreferenced_vertices()
     thinnest = float(mesh.extents.min())

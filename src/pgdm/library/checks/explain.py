@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from pgdm.errors import amount
 from pgdm.library.catalog import EXPERT_CURE, Library
 from pgdm.library.checks.compare import Difference, compare, compare_options
 from pgdm.library.checks.compiled import compiled
@@ -67,7 +68,7 @@ def explain_expert(library: Library, task: str) -> Iterator[str]:
     kind = "rebuilt, approximate" if entry.approximate else "published"
     yield f"\nexpert hand trajectory ({kind}): {entry.package}, {index.made_at}"
     yield f"  experts/{task}.npz  sha256 {file.sha256[:16]}  {file.licence}  from {file.origin}"
-    yield f"  poses: {entry.steps}, after {entry.skipped} skipped frames of the recording"
+    yield f"  poses: {entry.steps}, after {amount(entry.skipped, 'skipped frame')} of the recording"
     moved = ", ".join(f"{1e3 * x:.1f}" for x in entry.shift_m)
     yield (
         "  the recording's object deviates from the motion's by "
@@ -81,7 +82,8 @@ def explain_expert(library: Library, task: str) -> Iterator[str]:
     if entry.approximate:
         yield f"  over all {entry.steps} poses (the recording has no contact flag), by finger:"
     else:
-        yield f"  the hand touches the object at {entry.touching_frames} poses; by finger:"
+        touching = amount(entry.touching_frames, "pose")
+        yield f"  the hand touches the object at {touching}; by finger:"
     rows = zip(FINGERS, entry.contact_frames, entry.within_5mm, strict=True)
     yield "  " + "; ".join(f"{name} in contact {n}, within 5 mm {p:.0%}" for name, n, p in rows)
 
@@ -140,5 +142,5 @@ def motion_differences(library: Library, task: str, first: str, second: str) -> 
             continue
         apart = np.abs(one.starts[name].qpos - two.starts[name].qpos)
         if apart.max() > _MOTION_TOLERANCE:
-            count = int((apart > _MOTION_TOLERANCE).sum())
-            yield f"start {name}: {count} joints differ, by up to {apart.max():.3g} (m, rad)"
+            joints = amount(int((apart > _MOTION_TOLERANCE).sum()), "joint")
+            yield f"start {name}: differs in {joints}, by up to {apart.max():.3g} (m, rad)"

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
-from pgdm.errors import ConfigError
+from pgdm.errors import ConfigError, amount
 from pgdm.library.checks.lowest import lowest
 from pgdm.library.files.keyframes import continuous
 from pgdm.library.files.poses import resampled
@@ -56,8 +56,8 @@ def check_motion(poses: Poses, label: str) -> None:
     steps = len(poses.pos)
     if not STEPS[0] <= steps <= STEPS[1]:
         raise ConfigError(
-            f"{label}: {steps} poses ({steps * STEP_S:.1f} s); valid: {STEPS[0]} to {STEPS[1]}, "
-            f"one every {STEP_S:g} s"
+            f"{label}: {amount(steps, 'pose')} ({steps * STEP_S:.1f} s); valid: {STEPS[0]} to "
+            f"{STEPS[1]}, one every {STEP_S:g} s"
         )
     fast, turning = speeds(poses)
     for values, limit, unit, verb in (

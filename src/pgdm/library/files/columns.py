@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pgdm.errors import ConfigError, CorruptAssetError
+from pgdm.errors import ConfigError, CorruptAssetError, amount
 
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 """Columns of a pose, in the order of a table without names."""
@@ -51,11 +51,12 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
 
     Raises:
         CorruptAssetError: rows do not have C columns, a column of the pose is missing, or two have
-            the same meaning. (Of several time columns, the first is used.)
+            the same meaning.
     """
     if rows.ndim != 2 or rows.shape[1] != len(names):
         raise CorruptAssetError(
-            f"{label}: rows have shape {rows.shape} for {len(names)} columns: {', '.join(names)}"
+            f"{label}: rows have shape {rows.shape} for {amount(len(names), 'column')}: "
+            f"{', '.join(names)}"
         )
     meanings = [_meaning(name) for name in names]
     for wanted in POSE:
@@ -65,6 +66,11 @@ def by_name(rows: np.ndarray, names: Sequence[str], label: str) -> Table:
                 f"{', '.join(names)}; a pose takes {', '.join(POSE)} (lengths in m), "
                 "and optionally time (s)"
             )
+    clocks = [name for name, meaning in zip(names, meanings, strict=True) if meaning == "time"]
+    if len(clocks) > 1:
+        raise CorruptAssetError(
+            f"{label}: the columns {', '.join(clocks)} are all times; keep one, in s"
+        )
     times = rows[:, meanings.index("time")] if "time" in meanings else None
     others = [name for name, meaning in zip(names, meanings, strict=True) if not meaning]
     notes = [f"left out the columns {', '.join(others)}"] if others else []
@@ -93,17 +99,19 @@ def check_order(quat: np.ndarray, rest: Rotation, label: str, cure: str) -> None
 
     Raises:
         ConfigError: read as wxyz, the orientation is tilted or rotated far from the resting one;
-            read as xyzw, it is close by the same measure.
+            read as xyzw, it is close by the same measure. The message states that measure for both.
     """
     taken, other = (Rotation.from_quat(quat, scalar_first=f) * rest.inv() for f in (True, False))
     tilts = [float(np.arccos(np.clip(r.as_matrix()[2, 2], -1, 1))) for r in (taken, other)]
     tilted = tilts[0] > _TILTED_RAD and tilts[1] < _UPRIGHT_RAD
     flipped = taken.magnitude() > _FAR_RAD and other.magnitude() < _NEAR_RAD
     if tilted or (flipped and tilts[0] > tilts[1] - _LEVEL_RAD):
+        angles = tilts if tilted else [float(r.magnitude()) for r in (taken, other)]
+        wrong, right = (f"{angle:.0f}" for angle in np.rad2deg(angles))
         raise ConfigError(
-            f"{label}: read as w x y z its orientation is {np.rad2deg(taken.magnitude()):.0f} "
-            f"degrees from the object's resting orientation, as x y z w only "
-            f"{np.rad2deg(other.magnitude()):.0f}; {cure}"
+            f"{label}: read as w x y z its orientation is {'tilted' if tilted else 'turned'} by "
+            f"{wrong} degrees from the object's resting orientation, as x y z w only by {right}; "
+            f"{cure}"
         )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pgdm.errors import CorruptAssetError
+from pgdm.errors import CorruptAssetError, amount
 from pgdm.library.files import npz
 from pgdm.library.files.motion import numbers
 
@@ -69,7 +69,7 @@ def check(arrays: Mapping[str, Any], label: str) -> dict[str, np.ndarray]:
     qpos = numbers(arrays, "qpos", label, (None, JOINTS))
     steps, fingers = len(qpos), len(FINGERS)
     if steps < 2:
-        raise CorruptAssetError(f"{label}: qpos has {steps} rows, needs 2 or more")
+        raise CorruptAssetError(f"{label}: qpos has {amount(steps, 'row')}, needs 2 or more")
     return {
         "qpos": qpos,
         "human_joints": numbers(arrays, "human_joints", label, (steps, HUMAN_JOINTS, 3)),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pgdm.errors import CorruptAssetError
+from pgdm.errors import CorruptAssetError, amount
 from pgdm.library.files import npz
 
 STARTS = ("planned", "mined", "learned")
@@ -74,7 +74,9 @@ def check(
     translation = numbers(arrays, "object_translation", label, (None, 3))
     steps = len(translation)
     if steps < 2:
-        raise CorruptAssetError(f"{label}: object_translation has {steps} rows, needs 2 or more")
+        raise CorruptAssetError(
+            f"{label}: object_translation has {amount(steps, 'row')}, needs 2 or more"
+        )
     orientation = numbers(arrays, "object_orientation", label, (steps, 4))
     check_unit(orientation, "object_orientation", label)
     substeps = float(numbers(arrays, "substeps", label, ()))

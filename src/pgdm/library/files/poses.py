@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from pgdm import files
-from pgdm.errors import ConfigError, CorruptAssetError
+from pgdm.errors import ConfigError, CorruptAssetError, amount
 from pgdm.library.files import columns, npz
 from pgdm.library.files.columns import Table
 from pgdm.library.files.keyframes import LONGEST_S, continuous
@@ -121,7 +121,9 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
 
 def _check_times(times: np.ndarray, count: int, label: str) -> None:
     if times.shape != (count,) or not np.isfinite(times).all():
-        raise CorruptAssetError(f"{label}: has {times.size} times, needs {count} finite ones")
+        raise CorruptAssetError(
+            f"{label}: has {amount(times.size, 'time')}, needs {count} finite ones"
+        )
     if bad := _first(np.diff(times) <= 0):
         raise CorruptAssetError(
             f"{label}: row {bad} has time {times[bad]:g} s, not after {times[bad - 1]:g} s"
@@ -151,7 +153,7 @@ def _csv(path: Path) -> Table:
     if widths not in ([{len(names)}] if names else [{7}, {8}]):
         expected = len(names) or "7 (x y z qw qx qy qz) or 8 (time before them)"
         raise CorruptAssetError(
-            f"{path}: rows have {' and '.join(map(str, sorted(widths))) or 'no'} columns, expected "
+            f"{path}: columns of the rows: {' and '.join(map(str, sorted(widths))) or 0}, expected "
             f"{expected}"
         )
     for i, line in enumerate(lines):
@@ -228,6 +230,8 @@ def _with_names(
         raise CorruptAssetError(f"{path}: columns are {names!r:.60}, not a list of names")
     else:
         table = columns.by_name(rows, [str(name) for name in np.ravel(names)], str(path))
+        if times is not None and table.times is not None:
+            raise CorruptAssetError(f"{path}: has times in 'time' and in a column; keep one")
     others = sorted(str(key) for key in parts if key not in _PARTS)
     notes = [*table.notes, *([f"left out {', '.join(others)}"] if others else [])]
     return replace(table, times=table.times if times is None else times, notes=notes)

@@ -6,7 +6,6 @@ folder (:func:`pgdm.paths.user`); plain arrays, never pickled.
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -75,11 +74,7 @@ def set_aside(task: str) -> Path | None:
     folder = paths.inside(paths.user() / "pregrasps", task)
     if not folder.is_dir():
         return None
-    aside = next(
-        path
-        for i in itertools.count(1)
-        if not (path := folder.with_name(f"{task}.before-{i}")).exists()
-    )
+    aside = paths.unused(folder.parent, f"{task}.before")
     folder.rename(aside)
     return aside
 

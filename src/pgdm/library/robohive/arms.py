@@ -5,7 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from pgdm.errors import CorruptAssetError
+from pgdm.errors import CorruptAssetError, amount
 from pgdm.library.files import mjcf
 from pgdm.library.files import model as model_file
 
@@ -49,7 +49,9 @@ def panda(sims: Path, defects: list[str]) -> ET.Element:
     base = chain.find("body")
     links = [] if base is None else list(base.iter("body"))
     if base is None or len(links) != len(JOINT_RANGES_RAD) + 1:
-        raise CorruptAssetError(f"{folder.name}: its chain has {len(links)} bodies, not 8")
+        raise CorruptAssetError(
+            f"{folder.name}: its chain has {amount(len(links), 'body', 'bodies')}, not 8"
+        )
     root = mjcf.model("panda")
     _defaults(root)
     section = mjcf.add(root, "asset")

@@ -248,8 +248,8 @@ class Draft:
             return replace(loaded, notes=(*loaded.notes, f"{error}; kept as {aside.name}"))
 
     def set_aside(self) -> Path:
-        """Rename the draft that a previous run left, and return its new path."""
-        aside = self._path.with_name(f"{SOURCE}.draft-before.npz")
+        """Rename the draft that a previous run left, and return its new path, which is unused."""
+        aside = paths.unused(self._path.parent, f"{SOURCE}.draft-before", ".npz")
         self._path.replace(aside)
         return aside
 

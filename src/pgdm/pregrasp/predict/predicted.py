@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,20 +79,10 @@ def predict(
     found = propose(predictor, scene, objects, cfg.samples, cfg.seed, progress)
     lift = LiftTest(scene, motion.substeps, seed=cfg.seed, num_threads=num_threads)
     found = ranked(found, lift, progress)
-    chosen, plan = 0, None
-    for i, candidate in enumerate(found[:_TRIES] if cfg.reach else ()):
-        try:
-            tried = plan_reach(
-                scene, candidate.qpos, motion.substeps, seed=cfg.seed, num_threads=num_threads,
-                progress=lambda step, done, total, i=i: progress(f"plan {i + 1}", done, total),
-            )  # fmt: skip
-        except SceneError as error:  # every simulation diverges
-            notify(f"candidate {i + 1} is not reached: {error}")
-            continue
-        if tried.reached:
-            chosen, plan = i, tried
-            break
-        notify(f"candidate {i + 1} is not reached: {', '.join(tried.failures)}")
+    tries = found[:_TRIES] if cfg.reach else []
+    chosen, plan = _first_reached(
+        scene, tries, motion.substeps, cfg.seed, notify, progress, num_threads
+    )
     best = found[chosen]
     rate = best.quality.lift_rate
     note = {
@@ -109,6 +100,34 @@ def predict(
     pose = Start(best.qpos, np.zeros(scene.model.nv), None)
     pregrasp = Pregrasp(pose, None if plan is None else plan.state, note)
     return Predicted(found, chosen, plan, pregrasp)
+
+
+def _first_reached(
+    scene: Scene,
+    candidates: Sequence[Candidate],
+    substeps: int,
+    seed: int,
+    notify: Notify,
+    progress: StepProgress,
+    num_threads: int,
+) -> tuple[int, ReachPlan | None]:
+    """Return index and reach plan of the first candidate that is reached; if none is, 0 and None.
+
+    Why a candidate is not reached is passed to ``notify``.
+    """
+    for i, candidate in enumerate(candidates):
+        try:
+            plan = plan_reach(
+                scene, candidate.qpos, substeps, seed=seed, num_threads=num_threads,
+                progress=lambda step, done, total, i=i: progress(f"plan {i + 1}", done, total),
+            )  # fmt: skip
+        except SceneError as error:  # every simulation diverges
+            notify(f"candidate {i + 1} is not reached: {error}")
+            continue
+        if plan.reached:
+            return i, plan
+        notify(f"candidate {i + 1} is not reached: {', '.join(plan.failures)}")
+    return 0, None
 
 
 def _is_held_out(predictor: Predictor, scene: Scene, notify: Notify) -> bool:

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from pgdm.errors import ConfigError
+from pgdm.errors import ConfigError, amount
 from pgdm.library.progress import StepProgress, silent
 from pgdm.pregrasp.predict.encoding import object_code
 from pgdm.pregrasp.predict.grasp_vector import JOINTS, POSITION, ROTATION, GraspFrame, rotation_of
@@ -136,7 +136,7 @@ def fit(
     objects = sorted({e.object for e in examples})
     if len(objects) < LEAST_OBJECTS:
         raise ConfigError(
-            f"{len(examples)} pre-grasps of {len(objects)} objects with hand "
+            f"{amount(len(examples), 'pre-grasp')} of {amount(len(objects), 'object')} with hand "
             f"'{frame.scene.hand.name}': predicting for another object needs at least "
             f"{LEAST_OBJECTS} objects"
         )

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pgdm.errors import ConfigError, CorruptAssetError, UnknownNameError
+from pgdm.errors import ConfigError, CorruptAssetError, UnknownNameError, amount
 from pgdm.files import parse_json
 from pgdm.library.files import npz as safe_npz
 from pgdm.library.files.motion import check_unit, numbers
@@ -198,7 +198,7 @@ def _table(points: dict[tuple[int, int], list[float]], path: Path) -> np.ndarray
         raise ConfigError(f"{path}: joints go up to {joints - 1}; a hand has 0 to 15, or 0 to 20")
     if len(points) < joints or not 0 < frames <= MAX_FRAMES:
         raise CorruptAssetError(
-            f"{path}: {len(points)} rows for {frames} frames; expected "
+            f"{path}: {amount(len(points), 'row')} for {amount(frames, 'frame')}; expected "
             "a row for each joint in each of 1 to 100,000 frames, numbered from 0"
         )
     for frame in range(frames):

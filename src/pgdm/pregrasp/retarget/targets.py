@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from pgdm.errors import ConfigError, check_name
+from pgdm.errors import ConfigError, amount, check_name
 from pgdm.pregrasp.retarget.keypoints import FINGERS, Keypoints, filled, palm_axes
 from pgdm.sim.scene import Scene
 
@@ -150,8 +150,8 @@ class HandShape:
 def _check(hand: str, fingers: tuple[str, ...], fingertips: list[int], points: int) -> None:
     if len(fingers) != len(fingertips):
         raise ConfigError(
-            f"hand '{hand}': hand.human_fingers names {len(fingers)} fingers, hand.fingertips has "
-            f"{len(fingertips)}; inverse kinematics needs one for each"
+            f"hand '{hand}': hand.human_fingers names {amount(len(fingers), 'finger')}, "
+            f"hand.fingertips has {len(fingertips)}; inverse kinematics needs one for each"
         )
     for name in fingers:
         check_name(f"human finger in hand.human_fingers of '{hand}'", name, FINGERS)
