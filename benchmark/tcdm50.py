@@ -34,10 +34,14 @@ def place(task: str, seed: int) -> Path:
     return RESULTS / "runs" / f"{task}-s{seed}"
 
 
+def fast(cfg: ExperimentCfg) -> ExperimentCfg:
+    """Return today's recommended settings for a run's task and seed."""
+    return compose(["+experiment=fast", f"task={cfg.task.id}", f"seed={cfg.seed}"])
+
+
 def current(cfg: ExperimentCfg) -> bool:
     """Return whether a run has today's recommended settings."""
-    fast = compose(["+experiment=fast", f"task={cfg.task.id}", f"seed={cfg.seed}"])
-    return identity_hash(cfg) == identity_hash(fast)
+    return identity_hash(cfg) == identity_hash(fast(cfg))
 
 
 def wanted(found: RunFolder) -> bool:
@@ -49,7 +53,7 @@ def wanted(found: RunFolder) -> bool:
     if found.status() != "finished" or task not in TASKS:
         return False
     cfg = load_config(found.path)
-    if not current(cfg) or found.result["frames"] < compose(["+experiment=fast"]).total_frames:
+    if not current(cfg) or found.result["frames"] < fast(cfg).total_frames:
         return False
     before = place(task, cfg.seed)
     if not (before / RESULT).is_file() or not current(load_config(before)):

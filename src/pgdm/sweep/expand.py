@@ -113,8 +113,7 @@ def composed_jobs(
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """Pause the garbage collector: Hydra copies configs a million objects at a time, and scanning
-    them takes a quarter of a plan's time."""
+    """Pause the garbage collector, which would scan the many objects that Hydra copies."""
     enabled = gc.isenabled()
     gc.disable()
     try:
