@@ -96,26 +96,12 @@ class Tab:
         """Return the visible text of the page."""
         return str(self.script("document.body.innerText"))
 
-    def place(self, element: str) -> tuple[float, float]:
-        """Scroll to an element, a JavaScript expression, and return its middle, in pixels."""
-        script = (
-            f"(() => {{ const e = {element}; e.scrollIntoView({{block: 'center'}}); "
-            "const r = e.getBoundingClientRect(); "
-            "return [r.x + r.width / 2, r.y + r.height / 2]; })()"
-        )
-        x, y = self.script(script)
-        return float(x), float(y)
-
-    def click(self, element: str) -> None:
-        """Click an element."""
-        self.mouse("mousePressed", *self.place(element))
-        self.mouse("mouseReleased", *self.place(element))
-
     def click_button(self, label: str) -> None:
-        """Click the button with a label."""
+        """Click the button with a label, also if the page's layout is changing."""
         name = json.dumps(label)
-        self.click(
+        self.script(
             f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() === {name})"
+            ".click()"
         )
 
     def mouse(self, kind: str, x: float, y: float) -> None:
@@ -153,8 +139,7 @@ class Tab:
 
     def type_into(self, element: str, text: str) -> None:
         """Replace the text of an input, and press Enter."""
-        self.click(element)
-        self.script(f"{element}.select()")
+        self.script(f"(() => {{ const e = {element}; e.focus(); e.select(); }})()")
         self("Input.insertText", text=text)
         self.key("Enter", "Enter", 13)
 
