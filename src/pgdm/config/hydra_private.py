@@ -6,8 +6,8 @@ slow for a sweep of thousands of runs.
 
 from __future__ import annotations
 
-import copy
 import inspect
+import pickle
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -77,7 +77,10 @@ def check_interfaces() -> None:
 class _ReadOnce(ConfigLoaderImpl):
     """Hydra's loader, which here reads each file only once, for all compositions."""
 
-    _files: Any = None
+    def __init__(self, search_path: Any) -> None:
+        super().__init__(search_path)
+        self._files: Any = None
+        self._loaded: dict[tuple[Any, ...], tuple[ConfigResult, bytes]] = {}
 
     def _parse_overrides_and_create_caching_repo(
         self, config_name: str | None, overrides: list[str]
@@ -92,10 +95,14 @@ class _ReadOnce(ConfigLoaderImpl):
         return OverridesParser.create().parse_overrides(overrides), self._files
 
     def _load_single_config(self, default: Any, repo: Any) -> ConfigResult:
+        key = default.config_path, default.package, default.primary
+        if key not in self._loaded:
+            found = super()._load_single_config(default, repo)
+            self._loaded[key] = found, pickle.dumps(found.config)
         # A copy, since Hydra merges later files and overrides into these nodes in place, which
         # would change all later compositions.
-        found = super()._load_single_config(default, repo)
-        return replace(found, config=copy.deepcopy(found.config))
+        found, config = self._loaded[key]
+        return replace(found, config=pickle.loads(config))
 
 
 def _check_before_reading(source: ConfigSource) -> None:
