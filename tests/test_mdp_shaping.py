@@ -18,7 +18,7 @@ from pgdm.runs.files import read_json
 
 SETTINGS = ("task=hammer-use1", "shaping=soft_end", "shaping.soft_end_m=0.1")
 KERNEL = ("shaping.kernel_weight=5", "shaping.kernel_scale=10")
-NO_SHAPING = ShapingCfg("none", 0.0, 10.0, None)
+NO_SHAPING = ShapingCfg("none", 0.0, 10.0, None, None)
 
 
 @pytest.mark.usefixtures("library_home")

@@ -1,10 +1,12 @@
 """Shaping: what training may add to a task's reward and discount; evaluations never use it.
 
 The paper's reward is flat far from the target: exp(-50 e) is 0.05 at e = 6 cm, and the lift bonus
-does not depend on e. With the object error e [m], shaping replaces reward and
-discount factor gamma by
+does not depend on e. Neither depends on the object's orientation, although an object that turns in
+the hand is soon lost. With the object error e [m] and the angle phi [rad] between the object's
+orientation and its target, shaping replaces reward and discount factor gamma by
 
-    reward + kernel_weight exp(-kernel_scale e)    and    gamma exp(-(e / soft_end_m)^2)
+    reward + kernel_weight exp(-kernel_scale e)    and
+    gamma exp(-(e / soft_end_m)^2 - (phi / soft_end_rad)^2)
 
 the same for all tasks.
 """
@@ -35,7 +37,9 @@ class ShapingCfg:
     kernel_scale: float
     """Decay rate of that term, 1/m."""
     soft_end_m: float | None
-    """Scale of the extra discount, m; None: none."""
+    """Scale of the extra discount by the object error, m; None: none."""
+    soft_end_rad: float | None
+    """Scale of the extra discount by the object's angle, rad; None: none."""
 
     def described(self) -> str:
         """Return the shaping as a phrase, empty if it adds nothing."""
@@ -45,8 +49,11 @@ class ShapingCfg:
             parts.append(f"{self.kernel_weight:g} exp(-e/{width_m:.3g} m) is added to the reward")
         if self.soft_end_m is not None:
             parts.append(f"future rewards are scaled by exp(-(e/{self.soft_end_m:g} m)^2)")
+        if self.soft_end_rad is not None:
+            parts.append(f"future rewards are scaled by exp(-(phi/{self.soft_end_rad:g} rad)^2)")
+        angle = "" if self.soft_end_rad is None else " and the object's angle phi to its target"
         what = " and ".join(parts)
-        return f"with the object error e, {what}" if parts else ""
+        return f"with the object error e{angle}, {what}" if parts else ""
 
     def validate(self) -> None:
         """Check the numbers.
@@ -56,8 +63,9 @@ class ShapingCfg:
         """
         check_at_least("shaping.kernel_weight", self.kernel_weight, 0)
         check_above_zero("shaping.kernel_scale", self.kernel_scale)
-        if self.soft_end_m is not None:
-            check_above_zero("shaping.soft_end_m", self.soft_end_m)
+        for name in ("soft_end_m", "soft_end_rad"):
+            if (scale := getattr(self, name)) is not None:
+                check_above_zero(f"shaping.{name}", scale)
 
 
 def shaped(recipe: Recipe, cfg: ShapingCfg) -> Recipe:
@@ -70,11 +78,15 @@ def shaped(recipe: Recipe, cfg: ShapingCfg) -> Recipe:
 
         term = RewardTerm(SLOPE, cfg.kernel_weight, slope, shaping=True)
         recipe = replace(recipe, rewards=(*recipe.rewards, term))
-    if cfg.soft_end_m is not None:
-        reach = cfg.soft_end_m
+    if cfg.soft_end_m is not None or cfg.soft_end_rad is not None:
 
         def discount(c: StepContext) -> Tensor:
-            return torch.exp(-(c.object_error / reach).square())
+            exponent = torch.zeros_like(c.object_error)
+            if cfg.soft_end_m is not None:
+                exponent = exponent + (c.object_error / cfg.soft_end_m).square()
+            if cfg.soft_end_rad is not None:
+                exponent = exponent + (c.object_angle / cfg.soft_end_rad).square()
+            return torch.exp(-exponent)
 
         recipe = replace(recipe, discount=discount)
     return recipe
