@@ -59,6 +59,7 @@ from pgdm.methods import METHODS
         (["task.objects=[]"], "task.objects is empty"),
         (["task.placements=[{body: a, pos_m: [1], quat: null}]"], "pos_m has 1 number, not 3"),
         (["task.placements=[{body: a, pos_m: null, quat: [0,0,0,0]}]"], "quat is zero"),
+        (["obs=relative", "hand.points=[]", "hand.fingertips=[]"], "use obs=released"),
         (["hand.fingertips=[16]"], "fingertips has 16, but hand.points has 16 entries"),
     ],
 )  # fmt: skip

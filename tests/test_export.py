@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,25 @@ def test_safetensors_is_the_same_policy(exported: Exported, tmp_path: Path) -> N
     assert np.abs(acted.numpy() - exported.actions).max() < 1e-6
 
 
+def check_relative_parts(part: Callable[[str], np.ndarray], parts: dict[str, Any]) -> None:
+    """Compare the relative parts with the absolute positions in the same observation."""
+    positions = part("positions").reshape(-1, 3)
+    names = parts["positions"]["of"]
+    assert parts["position_in_hand"]["of"] == [names[-1], names[0]]
+    next_offset = part("targets_ahead")[4:7] - positions[-1]  # of the target at step t+1
+    assert np.allclose(part("offsets_to_targets")[3:6], next_offset, atol=1e-6)
+    # Rotations change no distances.
+    in_hand, tips = part("position_in_hand"), part("fingertips_from_object").reshape(-1, 3)
+    distance = np.linalg.norm(positions[-1] - positions[0])
+    assert np.isclose(np.linalg.norm(in_hand), distance, atol=1e-6)
+    apart = [
+        positions[names.index(n)] - positions[-1] for n in parts["fingertips_from_object"]["of"]
+    ]
+    assert len(tips) == 3 and np.allclose(
+        np.linalg.norm(tips, axis=1), np.linalg.norm(apart, axis=1), atol=1e-6
+    )
+
+
 def test_the_description_names_every_number(exported: Exported) -> None:
     about = description(exported.policy, exported.builder)
     parts = {part["name"]: part for part in about["observation"]}
@@ -174,6 +194,8 @@ def test_the_description_names_every_number(exported: Exported) -> None:
     target = exported.builder.mdp.reference.pos[1]
     assert np.allclose(part("targets_ahead")[4:7], target)  # k = 1: quaternion, then position
     assert np.allclose(part("time"), [0, 0, 0, 0, 1, 1, 1, 1])
+    if exported.policy.cfg.obs.layout == "relative":
+        check_relative_parts(part, parts)
     assert np.array_equal(np.float32(about["observation_by_step"][0]), seen[-29:])
     nu = exported.builder.scene.model.nu  # D'Manus: all
     assert about["control"] == {"timestep_s": 0.004, "substeps": 10, "compensated_joints": nu}

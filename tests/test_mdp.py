@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from pgdm import rotations
 from pgdm.errors import ConfigError, UnknownNameError
 from pgdm.mdp import rewards, terminations
 from pgdm.mdp.actions import ActionCfg, action_map
 from pgdm.mdp.context import StepContext
 from pgdm.mdp.metrics import Episodes, MetricsCfg, episode_metrics
-from pgdm.mdp.observations import ObsCfg, layout, released
+from pgdm.mdp.observations import ObsCfg, layout, relative, released
 from pgdm.sim.batch import SimState
 from tiny_scene import IDENTITY, QUARTER_Z, double, reference, tiny_index
 
@@ -120,6 +121,50 @@ def test_released_observation_entry_by_entry() -> None:
     phase = [c * 2 / 4 for c in (1, 4, 6, 8)]
     expected += [math.sin(p) for p in phase] + [math.cos(p) for p in phase]
     np.testing.assert_allclose(obs.numpy(), expected, rtol=1e-6)
+
+
+def test_relative_observation_entry_by_entry() -> None:
+    # Targets at x = 0, 1, 2, 3 m, turned by a quarter about z at the step observed, t = 2.
+    ref = reference([[float(k), 0.0, 0.0] for k in range(4)], [IDENTITY] * 2 + [QUARTER_Z] * 2)
+    index, now = tiny_index(), torch.tensor([2])
+    s = state([[2.03, 0.5, 0.0]], [IDENTITY])
+    observe = relative(index, ref)
+    obs = observe(s, now)[0].double()
+    near, later = [-0.03, -0.5, 0.0], [0.97, -0.5, 0.0]  # t+5 is after the last pose
+    expected = [*near, *later, *later, *(math.tanh(x / 0.03) for x in near)]
+    expected += [0.0, 0.0, math.sqrt(2)]  # twice the vector part of a quarter turn
+    point = s.point_pos[0, 0]
+    expected += [
+        *(s.object_pos[0] - point),
+        *s.object_quat[0],
+        *(s.object_vel - s.point_vel[:, 0])[0, :3],
+    ]
+    expected += [*(s.point_pos[0, torch.from_numpy(index.fingertips)] - s.object_pos[0]).flatten()]
+    extra = len(expected)
+    np.testing.assert_allclose(obs[:extra], np.array(expected, float), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(obs[extra:], released(index, ref)(s, now)[0].double())
+
+
+def test_relative_entries_of_hand_and_object_turn_with_them() -> None:
+    """Moving and turning hand and object together changes none of the entries of the grasp."""
+    ref, index = reference([[0.0, 0, 0]] * 2), tiny_index()
+    s = state([[2.0, 0.5, 0.1]], [QUARTER_Z])
+    quarter, shift = double([QUARTER_Z]), double([[0.3, -0.2, 1.0]])
+    turned = replace(
+        s,
+        object_pos=rotations.rotate(quarter, s.object_pos) + shift,
+        object_quat=-rotations.multiply(quarter, s.object_quat),  # the same rotation
+        point_pos=rotations.rotate(quarter[:, None], s.point_pos) + shift[:, None],
+        point_quat=rotations.multiply(quarter[:, None], s.point_quat),
+        object_vel=rotations.rotate(quarter[:, None], s.object_vel.view(1, 2, 3)).flatten(1),
+        point_vel=rotations.rotate(
+            quarter[:, None, None], s.point_vel.unflatten(-1, (2, 3))
+        ).flatten(2),
+    )
+    observe, now = relative(index, ref), torch.tensor([0])
+    grasp = slice(15, 25 + 3 * len(index.fingertips))
+    torch.testing.assert_close(observe(s, now)[0, grasp], observe(turned, now)[0, grasp])
+    assert not torch.allclose(observe(s, now)[0, :15], observe(turned, now)[0, :15])
 
 
 def test_unknown_layouts_and_kinds_are_errors_that_list_the_valid_ones() -> None:

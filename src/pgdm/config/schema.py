@@ -135,6 +135,12 @@ class ExperimentCfg:
                 f"{amount(len(hand.points), 'entry', 'entries')}: use 0 to {len(hand.points) - 1}"
             )
 
+        if self.obs.layout == "relative" and not hand.points:
+            raise ConfigError(
+                "obs=relative has the object's pose relative to the first of hand.points, which is "
+                "empty; name the hand's wrist there, or use obs=released"
+            )
+
     def _check_expert(self) -> None:
         if not recipe(self.method).needs_expert:
             return

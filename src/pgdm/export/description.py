@@ -10,6 +10,7 @@ import torch
 
 from pgdm.envs.build import EnvBuilder
 from pgdm.export.trained import TrainedPolicy
+from pgdm.mdp.observations import NEAR_M, RELATIVE_AHEAD
 
 FORMAT = "pgdm-policy-1"
 """Version of the description's layout, under the key ``format``."""
@@ -104,6 +105,7 @@ def _parts(layout: str, builder: EnvBuilder, joints: list[str]) -> list[_Part]:
             time,
         ]
     of = [*points, tracked]
+    relative = _relative_parts(builder, tracked, points) if layout == "relative" else []
     ahead = (
         "targets_ahead",
         21,
@@ -111,6 +113,7 @@ def _parts(layout: str, builder: EnvBuilder, joints: list[str]) -> list[_Part]:
         (),
     )
     return [
+        *relative,
         ("joint_positions", model.nq, "m, rad", joints),
         ("positions", 3 * len(of), "m, geom centres, then the object's centre of mass", of),
         ("orientations", 4 * len(of), "quaternion wxyz, of the bodies", of),
@@ -118,6 +121,42 @@ def _parts(layout: str, builder: EnvBuilder, joints: list[str]) -> list[_Part]:
         ("velocities", 6 * len(of), "linear m/s, then angular rad/s, at the positions", of),
         ahead,
         time,
+    ]
+
+
+def _relative_parts(builder: EnvBuilder, tracked: str, points: list[str]) -> list[_Part]:
+    tips = [points[i] for i in builder.scene.index.fingertips]
+    steps = ", ".join(f"t+{k}" if k else "t" for k in RELATIVE_AHEAD)
+    in_hand = [tracked, points[0]]
+    hand_frame = "in the frame of the second's body"
+    return [
+        (
+            "offsets_to_targets",
+            3 * len(RELATIVE_AHEAD),
+            f"m, from the object's centre of mass to its targets of steps {steps}, at most T-1",
+            [tracked],
+        ),
+        ("offset_saturated", 3, f"tanh of the first offset / {NEAR_M:g} m", [tracked]),
+        (
+            "rotation_to_target",
+            3,
+            "rad, twice the vector part of target(t) object^-1, scalar part >= 0",
+            [tracked],
+        ),
+        ("position_in_hand", 3, f"m, of the first relative to the second, {hand_frame}", in_hand),
+        ("orientation_in_hand", 4, f"quaternion wxyz, scalar part >= 0, {hand_frame}", in_hand),
+        (
+            "velocity_in_hand",
+            3,
+            f"m/s, linear, of the first minus the second, {hand_frame}",
+            in_hand,
+        ),
+        (
+            "fingertips_from_object",
+            3 * len(tips),
+            "m, relative to the object's centre of mass, in the object's frame",
+            tips,
+        ),
     ]
 
 

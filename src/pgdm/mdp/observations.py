@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pgdm import rotations
 from pgdm.errors import check_name
 from pgdm.motion.reference import ObjectReference
 from pgdm.sim.batch import SimState
@@ -23,7 +24,7 @@ class ObsCfg:
 
     layout: str
     """``released``: as in the released code; ``paper``: as in the paper, no velocities or later
-    targets."""
+    targets; ``relative``: ``released``, and the object relative to its targets and the hand."""
 
 
 def released(index: SceneIndex, reference: ObjectReference) -> Observe:
@@ -70,9 +71,59 @@ def paper(index: SceneIndex, reference: ObjectReference) -> Observe:
     return observe
 
 
+RELATIVE_AHEAD = 0, 1, 5
+"""Steps ahead of the targets whose distance from the object ``relative`` has."""
+NEAR_M = 0.03
+"""Scale of the saturating part of ``relative``: about where the tracking reward becomes flat."""
+
+
+def relative(index: SceneIndex, reference: ObjectReference) -> Observe:
+    """Return the layout ``relative``: the object relative to its targets and hand, then `released`.
+
+    From world-frame poses alone a network hardly sees a centimetre: it is a small difference of two
+    inputs that vary by decimetres. The additional entries, before those of ``released``:
+
+    offsets d_k from the object's centre of mass to its targets at steps t, t+1 and t+5, 3 each |
+    tanh(d_0 / 3 cm) (3) | rotation to the target at t (3) | with the hand's first point and its
+    body as frame: the object's position (3), orientation (4) and linear velocity (3), both
+    relative to the point | fingertips, relative to the object's centre of mass, in the
+    object's frame (3 each). A rotation is twice its quaternion's vector part; quaternions have a
+    scalar part of 0 or more. m, rad, m/s.
+    """
+    rest = released(index, reference)
+    tips, last = torch.from_numpy(index.fingertips), len(reference) - 1
+
+    def observe(s: SimState, t: Tensor) -> Tensor:
+        ahead = [(t + k).clamp(max=last) for k in RELATIVE_AHEAD]
+        offsets = [reference.pos[at] - s.object_pos for at in ahead]
+        from_object = rotations.conjugate(s.object_quat)
+        turn = _positive(rotations.multiply(reference.quat[t], from_object))
+        to_hand = rotations.conjugate(s.point_quat[:, 0])
+        velocity = (s.object_vel - s.point_vel[:, 0])[:, :3]
+        fingertips = s.point_pos[:, tips] - s.object_pos[:, None]
+        parts = (
+            *offsets,
+            torch.tanh(offsets[0] / NEAR_M),
+            2.0 * turn[:, 1:],
+            rotations.rotate(to_hand, s.object_pos - s.point_pos[:, 0]),
+            _positive(rotations.multiply(to_hand, s.object_quat)),
+            rotations.rotate(to_hand, velocity),
+            rotations.rotate(from_object[:, None], fingertips).flatten(1),
+        )
+        return torch.cat((torch.cat(parts, -1).float(), rest(s, t)), -1)
+
+    return observe
+
+
+def _positive(quat: Tensor) -> Tensor:
+    """Return quaternions (n, 4) of the same rotations with a scalar part of 0 or more."""
+    return torch.where(quat[:, :1] < 0, -quat, quat)
+
+
 LAYOUTS: dict[str, Callable[[SceneIndex, ObjectReference], Observe]] = {
     "released": released,
     "paper": paper,
+    "relative": relative,
 }
 
 

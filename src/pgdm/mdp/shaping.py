@@ -43,17 +43,15 @@ class ShapingCfg:
 
     def described(self) -> str:
         """Return the shaping as a phrase, empty if it adds nothing."""
-        parts = []
+        scales = (self.soft_end_m, "e", "m"), (self.soft_end_rad, "phi", "rad")
+        factors = [f"by exp(-({x}/{scale:g} {unit})^2)" for scale, x, unit in scales if scale]
+        parts = [f"future rewards are scaled {' and '.join(factors)}"] if factors else []
         if self.kernel_weight:
             width_m = 1 / self.kernel_scale
-            parts.append(f"{self.kernel_weight:g} exp(-e/{width_m:.3g} m) is added to the reward")
-        if self.soft_end_m is not None:
-            parts.append(f"future rewards are scaled by exp(-(e/{self.soft_end_m:g} m)^2)")
-        if self.soft_end_rad is not None:
-            parts.append(f"future rewards are scaled by exp(-(phi/{self.soft_end_rad:g} rad)^2)")
-        angle = "" if self.soft_end_rad is None else " and the object's angle phi to its target"
-        what = " and ".join(parts)
-        return f"with the object error e{angle}, {what}" if parts else ""
+            added = f"{self.kernel_weight:g} exp(-e/{width_m:.3g} m) is added to the reward"
+            parts.insert(0, added)
+        angle = " and the object's angle phi to its target" if self.soft_end_rad else ""
+        return f"with the object error e{angle}, {' and '.join(parts)}" if parts else ""
 
     def validate(self) -> None:
         """Check the numbers.
