@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from command_line import TINY, command
-from pgdm import rotations
 from pgdm.config.compose import compose
 from pgdm.errors import ConfigError
 from pgdm.experiment import env_builder
@@ -17,12 +16,9 @@ from pgdm.library import open_library
 from pgdm.mdp.shaping import SLOPE, ShapingCfg
 from pgdm.runs.files import read_json
 
-SETTINGS = (
-    *("task=hammer-use1", "shaping=soft_end"),
-    *("shaping.soft_end_m=0.1", "shaping.soft_end_rad=0.5"),
-)
+SETTINGS = ("task=hammer-use1", "shaping=soft_end", "shaping.soft_end_m=0.1")
 KERNEL = ("shaping.kernel_weight=5", "shaping.kernel_scale=10")
-NO_SHAPING = ShapingCfg("none", 0.0, 10.0, None, None)
+NO_SHAPING = ShapingCfg("none", 0.0, 10.0, None)
 
 
 @pytest.mark.usefixtures("library_home")
@@ -30,15 +26,12 @@ def test_training_has_slope_and_soft_end_and_evaluation_has_neither() -> None:
     builder = env_builder(compose([*SETTINGS, *KERNEL]), open_library())
     train, evaluation = builder.make(2, 1), builder.make(2, 1, stream="eval")
     own_sum = added_sum = torch.zeros(2).double()
-    for step in range(200):
+    for _ in range(200):
         action = train.warm_start().repeat(2, 1)
         _, reward, terminated, _, info = train.step(action)
         _, own, _, _, plain = evaluation.step(action)
         error = plain["object_error_m"]
-        quat = evaluation.sim.read().object_quat
-        angle = rotations.angle(quat, train.mdp.reference.quat[step + 1])
-        expected = torch.exp(-((error / 0.1) ** 2) - (angle / 0.5) ** 2)
-        torch.testing.assert_close(info["discount"], expected.float())
+        torch.testing.assert_close(info["discount"], torch.exp(-((error / 0.1) ** 2)).float())
         torch.testing.assert_close(info["terms"][SLOPE], 5 * torch.exp(-10 * error))
         torch.testing.assert_close(reward, (own + info["terms"][SLOPE]).float())
         assert plain["discount"] is None and SLOPE not in plain["terms"]
@@ -65,10 +58,6 @@ def test_the_additions_are_described_in_words() -> None:
     assert described == (
         "with the object error e, 5 exp(-e/0.1 m) is added to the reward and "
         "future rewards are scaled by exp(-(e/0.15 m)^2)"
-    )
-    assert replace(NO_SHAPING, soft_end_m=0.15, soft_end_rad=1.0).described() == (
-        "with the object error e and the object's angle phi to its target, "
-        "future rewards are scaled by exp(-(e/0.15 m)^2) and by exp(-(phi/1 rad)^2)"
     )
 
 
@@ -97,7 +86,6 @@ def test_a_result_records_the_additions_only_if_there_are_any(tmp_path: Path) ->
         ({"kernel_weight": -1.0}, "kernel_weight is -1.0; it must be at least 0"),
         ({"kernel_scale": 0.0}, "kernel_scale is 0.0; it must be above 0"),
         ({"soft_end_m": -0.1}, "soft_end_m is -0.1; it must be above 0"),
-        ({"soft_end_rad": 0.0}, "soft_end_rad is 0.0; it must be above 0"),
     ],
 )
 def test_invalid_numbers_are_named(changed: dict[str, float], message: str) -> None:

@@ -54,7 +54,6 @@ ADDED_LATER: dict[str, Any] = {
     "shaping.kernel_weight": 0.0,
     "shaping.kernel_scale": 10.0,
     "shaping.soft_end_m": None,
-    "shaping.soft_end_rad": None,
     "sim.engine": "mujoco",
     "sim.object_mass": "volume",
     "time_limit_min": None,

@@ -1,12 +1,10 @@
 """Shaping: what training may add to a task's reward and discount; evaluations never use it.
 
 The paper's reward is flat far from the target: exp(-50 e) is 0.05 at e = 6 cm, and the lift bonus
-does not depend on e. Neither depends on the object's orientation, although an object that turns in
-the hand is soon lost. With the object error e [m] and the angle phi [rad] between the object's
-orientation and its target, shaping replaces reward and discount factor gamma by
+does not depend on e. With the object error e [m], shaping replaces reward and
+discount factor gamma by
 
-    reward + kernel_weight exp(-kernel_scale e)    and
-    gamma exp(-(e / soft_end_m)^2 - (phi / soft_end_rad)^2)
+    reward + kernel_weight exp(-kernel_scale e)    and    gamma exp(-(e / soft_end_m)^2)
 
 the same for all tasks.
 """
@@ -37,21 +35,18 @@ class ShapingCfg:
     kernel_scale: float
     """Decay rate of that term, 1/m."""
     soft_end_m: float | None
-    """Scale of the extra discount by the object error, m; None: none."""
-    soft_end_rad: float | None
-    """Scale of the extra discount by the object's angle, rad; None: none."""
+    """Scale of the extra discount, m; None: none."""
 
     def described(self) -> str:
         """Return the shaping as a phrase, empty if it adds nothing."""
-        scales = (self.soft_end_m, "e", "m"), (self.soft_end_rad, "phi", "rad")
-        factors = [f"by exp(-({x}/{scale:g} {unit})^2)" for scale, x, unit in scales if scale]
-        parts = [f"future rewards are scaled {' and '.join(factors)}"] if factors else []
+        parts = []
         if self.kernel_weight:
             width_m = 1 / self.kernel_scale
-            added = f"{self.kernel_weight:g} exp(-e/{width_m:.3g} m) is added to the reward"
-            parts.insert(0, added)
-        angle = " and the object's angle phi to its target" if self.soft_end_rad else ""
-        return f"with the object error e{angle}, {' and '.join(parts)}" if parts else ""
+            parts.append(f"{self.kernel_weight:g} exp(-e/{width_m:.3g} m) is added to the reward")
+        if self.soft_end_m is not None:
+            parts.append(f"future rewards are scaled by exp(-(e/{self.soft_end_m:g} m)^2)")
+        what = " and ".join(parts)
+        return f"with the object error e, {what}" if parts else ""
 
     def validate(self) -> None:
         """Check the numbers.
@@ -61,9 +56,8 @@ class ShapingCfg:
         """
         check_at_least("shaping.kernel_weight", self.kernel_weight, 0)
         check_above_zero("shaping.kernel_scale", self.kernel_scale)
-        for name in ("soft_end_m", "soft_end_rad"):
-            if (scale := getattr(self, name)) is not None:
-                check_above_zero(f"shaping.{name}", scale)
+        if self.soft_end_m is not None:
+            check_above_zero("shaping.soft_end_m", self.soft_end_m)
 
 
 def shaped(recipe: Recipe, cfg: ShapingCfg) -> Recipe:
@@ -76,15 +70,11 @@ def shaped(recipe: Recipe, cfg: ShapingCfg) -> Recipe:
 
         term = RewardTerm(SLOPE, cfg.kernel_weight, slope, shaping=True)
         recipe = replace(recipe, rewards=(*recipe.rewards, term))
-    if cfg.soft_end_m is not None or cfg.soft_end_rad is not None:
+    if cfg.soft_end_m is not None:
+        reach = cfg.soft_end_m
 
         def discount(c: StepContext) -> Tensor:
-            exponent = torch.zeros_like(c.object_error)
-            if cfg.soft_end_m is not None:
-                exponent = exponent + (c.object_error / cfg.soft_end_m).square()
-            if cfg.soft_end_rad is not None:
-                exponent = exponent + (c.object_angle / cfg.soft_end_rad).square()
-            return torch.exp(-exponent)
+            return torch.exp(-(c.object_error / reach).square())
 
         recipe = replace(recipe, discount=discount)
     return recipe
