@@ -30,7 +30,7 @@ class SACCfg(AlgoCfg):
     """Settings of soft actor-critic; ``conf/algo/sac.yaml`` has the values."""
 
     usual_steps_per_s: ClassVar[float] = 400.0
-    usual_frame_bytes: ClassVar[int] = 1_400
+    usual_frame_bytes: ClassVar[int] = 1_500
 
     reward_scale: float
     """Factor on the rewards in the learner's targets."""
