@@ -58,7 +58,7 @@ def test_a_dry_run_shows_the_plan_and_leaves_nothing(tmp_path: Path) -> None:
 
 def test_a_plan_with_replays_says_what_they_take_and_that_they_are_slower() -> None:
     rows = shown(command("pgdm-run", *SMALL, "algo=sac", "seed=0,1", "total_frames=1_000_000"))
-    assert rows["disk"] == "about 1.4 GB for the replay of a job, until it has finished"
+    assert rows["disk"] == "about 1.5 GB for the replay of a job, until it has finished"
     kept = shown(command("pgdm-run", *SMALL, "algo=sac", "seed=0,1", "keep_replay=true"))
     assert kept["disk"].endswith("for the replay of a job, kept")
     assert "400 steps/s, which is assumed" in rows["time"]
