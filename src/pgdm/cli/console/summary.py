@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 PAPER_START = "planned"
 # Settings that the caption does not list as deviations: shown elsewhere, or irrelevant here.
 _NOT_PAPER = ("seed", "pregrasp", "eval.episodes")
-_SHOWN_CHANGES = 4
+_SHOWN_CHANGES = 5
 
 
 @dataclass(frozen=True)
