@@ -194,7 +194,7 @@ def test_the_description_names_every_number(exported: Exported) -> None:
     target = exported.builder.mdp.reference.pos[1]
     assert np.allclose(part("targets_ahead")[4:7], target)  # k = 1: quaternion, then position
     assert np.allclose(part("time"), [0, 0, 0, 0, 1, 1, 1, 1])
-    if exported.policy.cfg.obs.layout == "relative":
+    if exported.policy.cfg.algo.learner == "sac":  # `+experiment=fast`, with obs=relative
         check_relative_parts(part, parts)
     assert np.array_equal(np.float32(about["observation_by_step"][0]), seen[-29:])
     nu = exported.builder.scene.model.nu  # D'Manus: all

@@ -134,7 +134,6 @@ class ExperimentCfg:
                 f"hand.fingertips has {wrong[0]}, but hand.points has "
                 f"{amount(len(hand.points), 'entry', 'entries')}: use 0 to {len(hand.points) - 1}"
             )
-
         if self.obs.layout == "relative" and not hand.points:
             raise ConfigError(
                 "obs=relative has the object's pose relative to the first of hand.points, which is "

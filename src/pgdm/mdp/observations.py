@@ -74,7 +74,7 @@ def paper(index: SceneIndex, reference: ObjectReference) -> Observe:
 RELATIVE_AHEAD = 0, 1, 5
 """Steps ahead of the targets whose distance from the object ``relative`` has."""
 NEAR_M = 0.03
-"""Scale of the saturating part of ``relative``: about where the tracking reward becomes flat."""
+"""Scale of the saturating part of ``relative``; the tracking reward exp(-50 e) is 0.22 there."""
 
 
 def relative(index: SceneIndex, reference: ObjectReference) -> Observe:
