@@ -6,11 +6,11 @@
     python benchmark/learning.py --settings fast --seeds 0
     python benchmark/learning.py --collect          collect only, also from running runs
 
-There are six settings, each the same for all tasks: `+experiment=fast`; the same with the
-released observation, linear corrections, uncorrelated noise and without an average, as it was
-earlier; this with a clipped or a feasible wrist path instead of a plan; `algo=ppo_fast action=residual`; and the paper's PPO with its
-actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two runs train at a time,
-one thread each.
+There are six settings, each the same for all tasks: `+experiment=fast`; the same with the released
+observation, linear corrections, uncorrelated noise and without an average, as it was earlier; this
+with a clipped or a feasible wrist path instead of a plan; `algo=ppo_fast action=residual`; and the
+paper's PPO with its actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two
+runs train at a time, one thread each.
 """
 
 from __future__ import annotations
