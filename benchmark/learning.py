@@ -7,8 +7,8 @@
     python benchmark/learning.py --collect          collect only, also from running runs
 
 There are six settings, each the same for all tasks: `+experiment=fast`; the same with the released
-observation, linear corrections, uncorrelated noise and without an average, as it was earlier; this
-with a clipped or a feasible wrist path instead of a plan; `algo=ppo_fast action=residual`; and the
+observation, linear corrections, uncorrelated noise, and without an average and a reward for the
+grasp, as it was earlier; this with a clipped or a feasible wrist path instead of a plan; `algo=ppo_fast action=residual`; and the
 paper's PPO with its actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two
 runs train at a time, one thread each.
 """
@@ -40,6 +40,7 @@ FAST = ("+experiment=fast", "eval.interval_frames=50000")
 EARLIER = (
     *FAST,
     "obs=released",
+    "shaping=soft_end",
     "action.residual_power=1",
     "algo.noise_correlation=0",
     "algo.average_rate=0",

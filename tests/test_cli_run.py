@@ -225,7 +225,7 @@ def test_a_reduced_run_is_never_set_against_the_paper_without_saying_so() -> Non
     assert "2.00e-03" in text
     assert "COM error, released [m]" in text
     assert "not comparable with the paper's values: 524,288 of 50,000,000 frames" in text
-    for changed in ("action=residual", "algo=sac", "shaping=soft_end"):
+    for changed in ("action=residual", "algo=sac", "shaping=grasp"):
         assert changed in text
 
 

@@ -60,6 +60,7 @@ from pgdm.methods import METHODS
         (["task.placements=[{body: a, pos_m: [1], quat: null}]"], "pos_m has 1 number, not 3"),
         (["task.placements=[{body: a, pos_m: null, quat: [0,0,0,0]}]"], "quat is zero"),
         (["obs=relative", "hand.points=[]", "hand.fingertips=[]"], "use obs=released"),
+        (["shaping=grasp", "hand.fingertips=[]"], "use shaping=soft_end"),
         (["hand.fingertips=[16]"], "fingertips has 16, but hand.points has 16 entries"),
     ],
 )  # fmt: skip

@@ -95,7 +95,9 @@ def test_formulas_at_every_recorded_state(golden: tuple[BatchEnv, dict]) -> None
         state = sim.read()
         t = torch.tensor([k + 1])
         target = reference.pos[t], reference.quat[t]
-        context = StepContext(state, t, horizon - 1, *target, z0, sim.scene.index)
+        context = StepContext(
+            state, t, horizon - 1, *target, z0, torch.zeros(5, 3), sim.scene.index
+        )
         reward = sum(float(r.weight * r.value(context)[0]) for r in mdp.recipe.rewards)
         # Velocities of the points derive from a qvel recorded in float32: lower precision.
         np.testing.assert_allclose(

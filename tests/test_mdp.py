@@ -49,6 +49,7 @@ def context(pos: list, quat: list, target: list, target_quat: list, t: int = 1) 
         double(target),
         double(target_quat),
         double([0.1] * n),
+        double([[0.0, 0.0, 0.0]]),
         tiny_index(),
     )
 

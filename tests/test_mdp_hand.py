@@ -29,6 +29,7 @@ EXPERT = ExpertReference(
     contacts=double([[[9.0, 9, 9]] * 2, [[0.01, 0, 0], [0, 0.02, 0]], [[9.0, 9, 9]] * 2]),
     in_contact=torch.tensor([[False, False], [True, True], [True, False]]),
 )
+PREGRASP = double([[-0.3, -0.1, 0.0], [-0.1, -0.04, 0.0]])  # fingertips on the object
 
 
 def context(t: int = 1, expert: ExpertReference | None = EXPERT) -> StepContext:
@@ -46,7 +47,15 @@ def context(t: int = 1, expert: ExpertReference | None = EXPERT) -> StepContext:
     )
     steps = torch.tensor([t])
     zero = double([[0.0, 0, 0]])
-    return StepContext(state, steps, 2, zero, double([[1.0, 0, 0, 0]]), zero[:, 0], INDEX, expert)
+    target = zero, double([[1.0, 0, 0, 0]])
+    return StepContext(state, steps, 2, *target, zero[:, 0], PREGRASP, INDEX, expert)
+
+
+def test_kept_grasp_by_hand() -> None:
+    # On the object the fingertips are at (-0.3, -0.1, 0.03) and (-0.1, -0.04, 0) m; the first has
+    # moved by 3 cm.
+    expected = (math.exp(-20 * 0.03) + 1) / 2
+    assert rewards.kept_grasp(context(), 20.0).tolist() == pytest.approx([expected], abs=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,12 @@ from pgdm.config.compose import compose
 from pgdm.errors import ConfigError
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
-from pgdm.mdp.shaping import SLOPE, ShapingCfg
+from pgdm.mdp.shaping import GRASP, SLOPE, ShapingCfg
 from pgdm.runs.files import read_json
 
 SETTINGS = ("task=hammer-use1", "shaping=soft_end", "shaping.soft_end_m=0.1")
 KERNEL = ("shaping.kernel_weight=5", "shaping.kernel_scale=10")
-NO_SHAPING = ShapingCfg("none", 0.0, 10.0, None)
+NO_SHAPING = ShapingCfg("none", 0.0, 10.0, 0.0, 20.0, None)
 
 
 @pytest.mark.usefixtures("library_home")
@@ -52,6 +52,28 @@ def test_without_shaping_training_uses_the_recipe_of_evaluation() -> None:
     assert builder.make(1, 1).mdp.recipe is builder.mdp.recipe
 
 
+@pytest.mark.usefixtures("library_home")
+def test_a_hand_that_moves_with_the_object_earns_the_whole_grasp_term() -> None:
+    builder = env_builder(compose(["task=hammer-use1", "shaping=grasp"]), open_library())
+    train = builder.make(1, 1)
+    # At the start nothing has moved: the term is its weight. Straight fingers leave the object.
+    held = next(term for term in train.mdp.recipe.rewards if term.name == GRASP)
+    assert held.value(train._context(train.sim.read())).item() == pytest.approx(1.0, abs=1e-12)
+    open_hand = train.warm_start()[None].clone()
+    open_hand[:, 6:] = -1.0
+    values = [train.step(open_hand)[4]["raw_terms"][GRASP].item() for _ in range(5)]
+    assert values == sorted(values, reverse=True) and values[-1] < 0.5
+
+
+@pytest.mark.parametrize(
+    "far", [("pregrasp=none",), ("ablation=distance_15cm",), ("ablation=open_hand",)]
+)
+def test_only_an_intact_pregrasp_is_to_be_kept(far: tuple[str, ...]) -> None:
+    assert compose(["shaping=grasp"]).used_shaping.grasp_weight > 0
+    away = compose(["shaping=grasp", *far]).used_shaping
+    assert away.grasp_weight == 0 and away.soft_end_m == 0.15
+
+
 def test_the_additions_are_described_in_words() -> None:
     assert NO_SHAPING.described() == ""
     described = replace(NO_SHAPING, kernel_weight=5.0, soft_end_m=0.15).described()
@@ -59,6 +81,7 @@ def test_the_additions_are_described_in_words() -> None:
         "with the object error e, 5 exp(-e/0.1 m) is added to the reward and "
         "future rewards are scaled by exp(-(e/0.15 m)^2)"
     )
+    assert "3 exp(-d/0.05 m) is added" in replace(NO_SHAPING, grasp_weight=3.0).described()
 
 
 def test_a_dry_run_lists_the_additions(library_home: Path) -> None:
@@ -85,6 +108,8 @@ def test_a_result_records_the_additions_only_if_there_are_any(tmp_path: Path) ->
     [
         ({"kernel_weight": -1.0}, "kernel_weight is -1.0; it must be at least 0"),
         ({"kernel_scale": 0.0}, "kernel_scale is 0.0; it must be above 0"),
+        ({"grasp_weight": -1.0}, "grasp_weight is -1.0; it must be at least 0"),
+        ({"grasp_scale": 0.0}, "grasp_scale is 0.0; it must be above 0"),
         ({"soft_end_m": -0.1}, "soft_end_m is -0.1; it must be above 0"),
     ],
 )

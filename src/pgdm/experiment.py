@@ -73,7 +73,7 @@ def env_builder(
     if commands is not None:
         plans = partial(simulate, commands=commands)
     parts = (cfg.task, cfg.hand, cfg.sim, cfg.pregrasp, cfg.ablation)
-    env = EnvCfg(*parts, cfg.obs, cfg.action, cfg.reference, cfg.shaping)
+    env = EnvCfg(*parts, cfg.obs, cfg.action, cfg.reference, cfg.used_shaping)
     return EnvBuilder(library, env, recipe(cfg.method), plans)
 
 
@@ -130,7 +130,7 @@ def notes(cfg: ExperimentCfg, builder: EnvBuilder) -> list[str]:
     late, days = builder.mdp.recipe.unfinished(cfg.total_frames), cfg.usual_days
     return [
         *builder.notes,
-        *([f"in training only, {shaping}"] if (shaping := cfg.shaping.described()) else []),
+        *([f"in training only, {shaping}"] if (shaping := cfg.used_shaping.described()) else []),
         *([f"the training takes about {days:,.0f} days"] if days > _LONG_DAYS else []),
         *(_of_replay(cfg, builder) if cfg.algo.usual_frame_bytes else []),
         *(

@@ -19,7 +19,7 @@ def term_table(cfg: ExperimentCfg) -> Table:
     table = Table(box=None)
     for head in ("kind", "name", "weight"):
         table.add_column(head, no_wrap=True)
-    for row in shaped(recipe(cfg.method), cfg.shaping).table():
+    for row in shaped(recipe(cfg.method), cfg.used_shaping).table():
         table.add_row(*row)
     return table
 

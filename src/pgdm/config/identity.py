@@ -53,6 +53,8 @@ ADDED_LATER: dict[str, Any] = {
     "shaping.name": "none",
     "shaping.kernel_weight": 0.0,
     "shaping.kernel_scale": 10.0,
+    "shaping.grasp_weight": 0.0,
+    "shaping.grasp_scale": 20.0,
     "shaping.soft_end_m": None,
     "sim.engine": "mujoco",
     "sim.object_mass": "volume",

@@ -85,6 +85,12 @@ class ExperimentCfg:
     offline: bool
     """Whether missing assets are an error instead of being fetched."""
 
+    @property
+    def used_shaping(self) -> ShapingCfg:
+        """The shaping, without its grasp term if episodes do not start at an intact pre-grasp."""
+        intact = self.pregrasp.source != "none" and not self.ablation.changes_start
+        return self.shaping if intact else self.shaping.without_grasp()
+
     def validate(self) -> None:
         """Check names, choices and ranges of single fields, and the rules that hold between fields.
 
@@ -138,6 +144,12 @@ class ExperimentCfg:
             raise ConfigError(
                 "obs=relative has the object's pose relative to the first of hand.points, which is "
                 "empty; name the hand's wrist there, or use obs=released"
+            )
+
+        if self.shaping.grasp_weight and not hand.fingertips:
+            raise ConfigError(
+                "shaping.grasp_weight rewards fingertips that stay on the object, and "
+                "hand.fingertips is empty; name them there, or use shaping=soft_end"
             )
 
     def _check_expert(self) -> None:

@@ -15,7 +15,7 @@ from pgdm.envs.divergence import History
 from pgdm.envs.episodes import RunningEpisodes
 from pgdm.errors import ConfigError, RunError, check_name
 from pgdm.mdp.actions import ActionMap
-from pgdm.mdp.context import StepContext
+from pgdm.mdp.context import StepContext, on_object
 from pgdm.mdp.observations import Observe
 from pgdm.mdp.recipe import Recipe
 from pgdm.motion.reference import ExpertReference, ObjectReference
@@ -91,7 +91,7 @@ class BatchEnv:
         """Restart simulations ids (k,), or all; return the observations of all, (N, D) float32."""
         rows = self._all if ids is None else torch.as_tensor(ids, device=self.device)
         self._restart(rows, self.mdp.start.qpos, self.mdp.start.qvel)
-        obs, pos, quat = self._start
+        obs, pos, quat, _ = self._start
         self._episodes.place(rows, pos, quat)
         if len(rows) == self.num_envs:
             self._obs = obs.repeat(self.num_envs, 1)
@@ -263,15 +263,19 @@ class BatchEnv:
         self._t[rows] = 0
         self._episodes.restart(rows)
 
-    def _read_start(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the observation (D,) and the object's position (3,) and quaternion (4,) at reset.
+    def _read_start(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return what is read at reset.
+
+        Observation (D,), the object's position (3,) and quaternion (4,), and the fingertips in its
+        frame (F, 3).
 
         They are the same after every reset: a ``Randomizer`` does not change the pose.
         """
         one = self._all[:1]
         self.sim.reset(one, self.mdp.start.qpos, self.mdp.start.qvel)
         state = self.sim.read(one)
-        return self.mdp.observe(state, self._t[:1])[0], state.object_pos[0], state.object_quat[0]
+        obs, tips = self.mdp.observe(state, self._t[:1]), on_object(state, self.sim.scene.index)
+        return obs[0], state.object_pos[0], state.object_quat[0], tips[0]
 
     def _context(self, state: SimState) -> StepContext:
         reference = self.mdp.reference
@@ -282,6 +286,7 @@ class BatchEnv:
             target_pos=reference.pos[self._t],
             target_quat=reference.quat[self._t],
             start_height=self._episodes.start_height,
+            pregrasp_fingertips=self._start[3],
             index=self.sim.scene.index,
             expert=self.mdp.expert,
         )

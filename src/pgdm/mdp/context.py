@@ -20,6 +20,12 @@ FORMS = ("squared", "norm")
 """Forms of a distance: |d|^2 or |d|."""
 
 
+def on_object(state: SimState, index: SceneIndex) -> Tensor:
+    """Return the fingertips relative to the object's centre of mass, in its frame, (n, F, 3) m."""
+    offset = state.point_pos[:, torch.from_numpy(index.fingertips)] - state.object_pos[:, None]
+    return rotations.rotate(rotations.conjugate(state.object_quat)[:, None], offset)
+
+
 @dataclass(frozen=True)
 class StepContext:
     """State of n simulations after a step, and the targets of that step."""
@@ -30,6 +36,7 @@ class StepContext:
     target_pos: Tensor  # (n, 3) m, where the object's centre of mass should be
     target_quat: Tensor  # (n, 4) wxyz
     start_height: Tensor  # (n,) m, height of the object's centre of mass at reset
+    pregrasp_fingertips: Tensor  # (F, 3) m, fingertips at reset, in the object's frame
     index: SceneIndex
     expert: ExpertReference | None = None
 
@@ -47,6 +54,11 @@ class StepContext:
     def fingertips(self) -> Tensor:
         """Positions of the hand's fingertips, (n, F, 3) m."""
         return self.state.point_pos[:, torch.from_numpy(self.index.fingertips)]
+
+    @cached_property
+    def fingertips_on_object(self) -> Tensor:
+        """Positions of the fingertips in the object's frame, (n, F, 3) m."""
+        return on_object(self.state, self.index)
 
     @cached_property
     def joints(self) -> Tensor:

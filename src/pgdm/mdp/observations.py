@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pgdm import rotations
 from pgdm.errors import check_name
+from pgdm.mdp.context import on_object
 from pgdm.motion.reference import ObjectReference
 from pgdm.sim.batch import SimState
 from pgdm.sim.scene import SceneIndex
@@ -91,7 +92,7 @@ def relative(index: SceneIndex, reference: ObjectReference) -> Observe:
     scalar part of 0 or more. m, rad, m/s.
     """
     rest = released(index, reference)
-    tips, last = torch.from_numpy(index.fingertips), len(reference) - 1
+    last = len(reference) - 1
 
     def observe(s: SimState, t: Tensor) -> Tensor:
         ahead = [(t + k).clamp(max=last) for k in RELATIVE_AHEAD]
@@ -100,7 +101,6 @@ def relative(index: SceneIndex, reference: ObjectReference) -> Observe:
         turn = _positive(rotations.multiply(reference.quat[t], from_object))
         to_hand = rotations.conjugate(s.point_quat[:, 0])
         velocity = (s.object_vel - s.point_vel[:, 0])[:, :3]
-        fingertips = s.point_pos[:, tips] - s.object_pos[:, None]
         parts = (
             *offsets,
             torch.tanh(offsets[0] / NEAR_M),
@@ -108,7 +108,7 @@ def relative(index: SceneIndex, reference: ObjectReference) -> Observe:
             rotations.rotate(to_hand, s.object_pos - s.point_pos[:, 0]),
             _positive(rotations.multiply(to_hand, s.object_quat)),
             rotations.rotate(to_hand, velocity),
-            rotations.rotate(from_object[:, None], fingertips).flatten(1),
+            on_object(s, index).flatten(1),
         )
         return torch.cat((torch.cat(parts, -1).float(), rest(s, t)), -1)
 

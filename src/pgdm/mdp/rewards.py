@@ -49,6 +49,15 @@ def lift(c: StepContext, height_m: float) -> Tensor:
     return (lower >= c.start_height + height_m).double()
 
 
+def kept_grasp(c: StepContext, scale: float) -> Tensor:
+    """Return the mean of exp(-scale d) over the fingertips, (n,) in (0, 1].
+
+    d [m] is how far a fingertip has moved since the start, in the object's frame (pgdm's own).
+    """
+    moved = torch.linalg.vector_norm(c.fingertips_on_object - c.pregrasp_fingertips, dim=-1)
+    return torch.exp(-scale * moved).mean(1)
+
+
 def hand_imitation(c: StepContext, space: str, form: str, scale: float) -> Tensor:
     """Return exp(-scale d), (n,) in (0, 1], with the hand error d (DeepMimic; paper, App. D).
 

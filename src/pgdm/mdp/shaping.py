@@ -1,17 +1,20 @@
 """Shaping: what training may add to a task's reward and discount; evaluations never use it.
 
 The paper's reward is flat far from the target: exp(-50 e) is 0.05 at e = 6 cm, and the lift bonus
-does not depend on e. With the object error e [m], shaping replaces reward and
-discount factor gamma by
+does not depend on e. It says nothing about how to hold the object either: a pinch that fails
+later earns as much as a firm grasp. With the object error e [m] and the displacement d_f [m] of
+each of F fingertips, in the object's frame, since the start, shaping replaces reward and discount
+factor gamma by
 
-    reward + kernel_weight exp(-kernel_scale e)    and    gamma exp(-(e / soft_end_m)^2)
+    reward + kernel_weight exp(-kernel_scale e) + grasp_weight mean_f exp(-grasp_scale d_f)
 
-the same for all tasks.
+and gamma exp(-(e / soft_end_m)^2), the same for all tasks.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -19,9 +22,13 @@ from torch import Tensor
 from pgdm.errors import check_above_zero, check_at_least
 from pgdm.mdp.context import StepContext
 from pgdm.mdp.recipe import Recipe, RewardTerm
+from pgdm.mdp.rewards import kept_grasp
 
 SLOPE = "slope"
-"""Recorded name of the added reward term, a tracking term wider than the paper's."""
+"""Recorded name of the wide tracking term."""
+GRASP = "grasp"
+"""Recorded name of the grasp term, which pays for keeping the fingertips where the pre-grasp has
+them."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +41,16 @@ class ShapingCfg:
     """Weight of the wide tracking term; 0: none."""
     kernel_scale: float
     """Decay rate of that term, 1/m."""
+    grasp_weight: float
+    """Weight of the grasp term; 0: none."""
+    grasp_scale: float
+    """Decay rate of that term, 1/m."""
     soft_end_m: float | None
     """Scale of the extra discount, m; None: none."""
+
+    def without_grasp(self) -> ShapingCfg:
+        """Return the shaping without the grasp term, for starts that are not a pre-grasp."""
+        return replace(self, grasp_weight=0.0)
 
     def described(self) -> str:
         """Return the shaping as a phrase, empty if it adds nothing."""
@@ -43,6 +58,12 @@ class ShapingCfg:
         if self.kernel_weight:
             width_m = 1 / self.kernel_scale
             parts.append(f"{self.kernel_weight:g} exp(-e/{width_m:.3g} m) is added to the reward")
+        if self.grasp_weight:
+            width_m = 1 / self.grasp_scale
+            parts.append(
+                f"{self.grasp_weight:g} exp(-d/{width_m:.3g} m) is added for fingertips that moved "
+                "by d on the object since the pre-grasp"
+            )
         if self.soft_end_m is not None:
             parts.append(f"future rewards are scaled by exp(-(e/{self.soft_end_m:g} m)^2)")
         what = " and ".join(parts)
@@ -56,20 +77,24 @@ class ShapingCfg:
         """
         check_at_least("shaping.kernel_weight", self.kernel_weight, 0)
         check_above_zero("shaping.kernel_scale", self.kernel_scale)
+        check_at_least("shaping.grasp_weight", self.grasp_weight, 0)
+        check_above_zero("shaping.grasp_scale", self.grasp_scale)
         if self.soft_end_m is not None:
             check_above_zero("shaping.soft_end_m", self.soft_end_m)
 
 
 def shaped(recipe: Recipe, cfg: ShapingCfg) -> Recipe:
-    """Return the recipe with the shaping's reward term and discount."""
-    if cfg.kernel_weight:
-        scale = cfg.kernel_scale
+    """Return the recipe with the shaping's reward terms and discount."""
 
-        def slope(c: StepContext) -> Tensor:
-            return torch.exp(-scale * c.object_error)
+    def slope(c: StepContext) -> Tensor:
+        return torch.exp(-cfg.kernel_scale * c.object_error)
 
-        term = RewardTerm(SLOPE, cfg.kernel_weight, slope, shaping=True)
-        recipe = replace(recipe, rewards=(*recipe.rewards, term))
+    added = (
+        RewardTerm(SLOPE, cfg.kernel_weight, slope, shaping=True),
+        RewardTerm(GRASP, cfg.grasp_weight, partial(kept_grasp, scale=cfg.grasp_scale), True),
+    )
+    if added := tuple(term for term in added if term.weight):
+        recipe = replace(recipe, rewards=(*recipe.rewards, *added))
     if cfg.soft_end_m is not None:
         reach = cfg.soft_end_m
 
