@@ -8,9 +8,9 @@
 
 There are six settings, each the same for all tasks: `+experiment=fast`; the same with the released
 observation, linear corrections, uncorrelated noise, and without an average and a reward for the
-grasp, as it was earlier; this with a clipped or a feasible wrist path instead of a plan; `algo=ppo_fast action=residual`; and the
-paper's PPO with its actions. Each run is an ordinary `pgdm-run`: the same command resumes it. Two
-runs train at a time, one thread each.
+grasp, as it was earlier; this with a clipped or a feasible wrist path instead of a plan;
+`algo=ppo_fast action=residual`; and the paper's PPO with its actions. Each run is an ordinary
+`pgdm-run`: the same command resumes it. Two runs train at a time, one thread each.
 """
 
 from __future__ import annotations
