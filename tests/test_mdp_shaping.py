@@ -81,7 +81,7 @@ def test_the_additions_are_described_in_words() -> None:
         "with the object error e, 5 exp(-e/0.1 m) is added to the reward and "
         "future rewards are scaled by exp(-(e/0.15 m)^2)"
     )
-    assert "3 exp(-d/0.05 m) is added" in replace(NO_SHAPING, grasp_weight=3.0).described()
+    assert "3 exp(-d/0.05 m), averaged over" in replace(NO_SHAPING, grasp_weight=3.0).described()
 
 
 def test_a_dry_run_lists_the_additions(library_home: Path) -> None:

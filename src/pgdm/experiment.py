@@ -275,7 +275,7 @@ def _trainer(
 
 def _recorder(cfg: ExperimentCfg, builder: EnvBuilder, notify: Notify) -> Recorder:
     facts: dict[str, Any] = dict(builder.facts())
-    if shaping := cfg.shaping.described():
+    if shaping := cfg.used_shaping.described():
         facts["shaping"] = shaping
     facts["git"] = git_revision()
     if cfg.sim.engine == WARP:

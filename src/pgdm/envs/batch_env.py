@@ -264,12 +264,10 @@ class BatchEnv:
         self._episodes.restart(rows)
 
     def _read_start(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return what is read at reset.
+        """Return observation (D,), object position (3,) and quaternion (4,), fingertips (F, 3).
 
-        Observation (D,), the object's position (3,) and quaternion (4,), and the fingertips in its
-        frame (F, 3).
-
-        They are the same after every reset: a ``Randomizer`` does not change the pose.
+        They are the same after every reset, as a ``Randomizer`` does not change poses. The
+        fingertips are in the object's frame.
         """
         one = self._all[:1]
         self.sim.reset(one, self.mdp.start.qpos, self.mdp.start.qvel)

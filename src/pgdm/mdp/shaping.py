@@ -61,8 +61,8 @@ class ShapingCfg:
         if self.grasp_weight:
             width_m = 1 / self.grasp_scale
             parts.append(
-                f"{self.grasp_weight:g} exp(-d/{width_m:.3g} m) is added for fingertips that moved "
-                "by d on the object since the pre-grasp"
+                f"{self.grasp_weight:g} exp(-d/{width_m:.3g} m), averaged over the fingertips, is "
+                "added, with d how far each has moved on the object since the pre-grasp"
             )
         if self.soft_end_m is not None:
             parts.append(f"future rewards are scaled by exp(-(e/{self.soft_end_m:g} m)^2)")
