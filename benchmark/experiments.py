@@ -59,6 +59,18 @@ EXPERIMENTS = (
         "yes: soft end",
     ),
     Experiment(
+        "no-grasp-term",
+        "without a reward for fingertips that stay on the object, it is pinched or never lifted",
+        ("shaping=soft_end",),
+        "yes: grasp",
+    ),
+    Experiment(
+        "world-frame",
+        "in world-frame poses a centimetre is hardly seen",
+        ("obs=released",),
+        "yes: relative",
+    ),
+    Experiment(
         "kernel",
         "the wide tracking term, 5 exp(-10 e), gives a reward gradient everywhere",
         ("shaping.kernel_weight=5",),
