@@ -1,16 +1,18 @@
-"""Measure what pgdm learns in a million frames on six varied tasks; store results and curves.
+"""Compare `+experiment=fast` with other settings on six varied tasks; store results and curves.
 
     python benchmark/learning.py                    train what is missing, then collect
     python benchmark/learning.py --frames 300000    train for fewer frames; a later call resumes
                                                     (a run started as longer is trained to its end)
-    python benchmark/learning.py --settings fast --seeds 0
+    python benchmark/learning.py --settings ppo_fast-planned --tasks hammer-use1
     python benchmark/learning.py --collect          collect only, also from running runs
 
-There are six settings, each the same for all tasks: `+experiment=fast`; the same with the released
-observation, linear corrections, uncorrelated noise, and without an average and a reward for the
-grasp, as it was earlier; this with a clipped or a feasible wrist path instead of a plan;
-`algo=ppo_fast action=residual`; and the paper's PPO with its actions. Each run is an ordinary
-`pgdm-run`: the same command resumes it. Two runs train at a time, one thread each.
+The runs of `+experiment=fast` itself are those that tcdm50.py has stored. The other settings, each
+the same for all tasks: `fast-earlier` has the released observation, linear corrections,
+uncorrelated noise, and neither an average nor a reward for the grasp; `fast-clipped` and `fast-feasible` are
+the same with another wrist path; `ppo_fast-planned` is `+experiment=fast` with another learner,
+`algo=ppo_fast`; `ppo_fast-residual` has the carried wrist path, the released observation and no
+shaping; and `ppo-absolute` is the paper's PPO with its actions. Each run is an ordinary `pgdm-run`:
+the same command resumes it. Two runs train at a time, one thread each.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+import tcdm50
 from short_runs import Job, curves, train_all
 
 from pgdm.config.compose import compose
@@ -36,9 +39,9 @@ EARLY = 300_000
 """The table also shows success after this many frames."""
 
 QUICK6 = suite("quick6")
-FAST = ("+experiment=fast", "eval.interval_frames=50000")
 EARLIER = (
-    *FAST,
+    "+experiment=fast",
+    "eval.interval_frames=50000",
     "obs=released",
     "shaping=soft_end",
     "action.residual_power=1",
@@ -46,14 +49,26 @@ EARLIER = (
     "algo.average_rate=0",
 )
 SETTINGS = {
-    "fast": FAST,
+    "fast": ("+experiment=fast",),
     "fast-earlier": EARLIER,
     "fast-clipped": (*EARLIER, "action.wrist_path=clipped"),
     "fast-feasible": (*EARLIER, "action.wrist_path=feasible"),
+    "ppo_fast-planned": (
+        "algo=ppo_fast",
+        "obs=relative",
+        "shaping=grasp",
+        "action=residual",
+        "action.residual_power=2",
+        "action.wrist_path=planned",
+        "action.hold_steps=3",
+        "action.carry_load=true",
+        "eval.interval_frames=100000",
+    ),
     "ppo_fast-residual": ("algo=ppo_fast", "action=residual", "eval.interval_frames=100000"),
     "ppo-absolute": ("algo=ppo", "action=absolute", "eval.interval_frames=100000"),
 }
 SEEDS = {setting: (0, 1, 2) if setting == "fast" else (0,) for setting in SETTINGS}
+TRAINED = [setting for setting in SETTINGS if setting != "fast"]
 COMMON = ("eval.video_every_eval=false", "keep_replay=true")
 CURVES = ("success", "lifted", "return", "com_error")
 KINDS = ("eval_sampled", "eval_deterministic")
@@ -90,7 +105,11 @@ def collect(run: Path, job: Job) -> dict[str, Any] | None:
 
 def stored(job: Job) -> dict[str, Any]:
     """Return the stored result of a run; empty if there is none."""
-    return read_json(RESULTS / f"{job.name}.json")
+    if job.setting in TRAINED:
+        return read_json(RESULTS / f"{job.name}.json")
+    run = tcdm50.place(job.task, job.seed or 0)
+    found = (run / CONFIG).is_file() and tcdm50.current(load_config(run))
+    return (collect(run, job) or {}) if found else {}
 
 
 def store(job: Job, one: dict[str, Any]) -> None:
@@ -237,9 +256,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=Path, default=Path("runs/learning"))
     parser.add_argument("--frames", type=int, default=FRAMES, help="frames to train for")
-    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
+    parser.add_argument("--settings", nargs="+", choices=TRAINED, default=TRAINED)
     parser.add_argument("--tasks", nargs="+", choices=QUICK6, default=QUICK6)
-    parser.add_argument("--seeds", nargs="+", type=int, help="only these seeds of each setting")
     parser.add_argument("--collect", action="store_true", help="do not train")
     options = parser.parse_args()
     every = [
@@ -253,13 +271,12 @@ def main() -> None:
         for job in every
         if job.setting in options.settings
         and job.task in options.tasks
-        and job.seed in (options.seeds or [job.seed])
         and (longer := to_train(options.runs, job, options.frames)) is not None
     ]
     if not options.collect:
         train_all(options.runs, wanted)
     RESULTS.mkdir(parents=True, exist_ok=True)
-    for job in every:
+    for job in (job for job in every if job.setting in TRAINED):
         one = collect(options.runs / job.name, job)
         if one is not None:
             store(job, one)

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pgdm.config.compose import compose
-from pgdm.config.saved import save_config
+from pgdm.config.saved import load_config, save_config
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmark"))
 import experiments
 import learning
+import tcdm50
 from short_runs import Job
 
-JOB = Job("door-open", "fast", ("+experiment=fast",), 0)
+JOB = Job("door-open", "fast-earlier", ("+experiment=fast",), 0)
 
 
 def result(task: str, success: float, frames: int = 1_000_000, **more: Any) -> dict[str, Any]:
@@ -59,6 +62,23 @@ def test_what_is_stored_is_not_trained_again_and_no_run_is_asked_to_shrink(
     learning.store(JOB, result("door-open", 0.5, 300_032))
     assert learning.to_train(tmp_path, JOB, 300_000) is None
     assert learning.to_train(tmp_path, JOB, 1_000_000) is not None
+
+
+def test_recommended_runs_are_those_stored_by_tcdm50_unless_they_have_earlier_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = Job("hammer-use1", "fast", ("+experiment=fast",), 0)
+    run = tcdm50.place(job.task, 0)
+    fast = tcdm50.fast(load_config(run))
+    monkeypatch.setattr(tcdm50, "RESULTS", tmp_path)
+    assert learning.stored(job) == {}
+    shutil.copytree(run, tcdm50.place(job.task, 0))
+    save_config(fast, tcdm50.place(job.task, 0))
+    one = learning.stored(job)
+    assert one["frames"] >= 300_000 and len(one["curve_minutes"]) == len(one["curve_frames"])
+    assert one["metrics"]["eval_sampled/success"] > 0.5
+    save_config(replace(fast, num_envs=32), tcdm50.place(job.task, 0))
+    assert learning.stored(job) == {}
 
 
 def test_old_scenes_are_marked_and_in_no_mean_and_missing_times_are_told() -> None:
