@@ -6,13 +6,14 @@
     python benchmark/learning.py --settings ppo_fast-planned --tasks hammer-use1
     python benchmark/learning.py --collect          collect only, also from running runs
 
-The runs of `+experiment=fast` itself are those that tcdm50.py has stored. The other settings, each
-the same for all tasks: `fast-earlier` has the released observation, linear corrections,
+The runs of `+experiment=fast` itself are those that tcdm50.py has stored. The other settings,
+each the same for all tasks: `fast-earlier` has the released observation, linear corrections,
 uncorrelated noise, and neither an average nor a reward for the grasp; `fast-clipped` and
-`fast-feasible` are the same with another wrist path; `ppo_fast-planned` is `+experiment=fast` with another learner,
-`algo=ppo_fast`; `ppo_fast-residual` has the carried wrist path, the released observation and no
-shaping; and `ppo-absolute` is the paper's PPO with its actions. Each run is an ordinary `pgdm-run`:
-the same command resumes it. Two runs train at a time, one thread each.
+`fast-feasible` are the same with another wrist path; `ppo_fast-planned` is `+experiment=fast`
+with another learner, `algo=ppo_fast`; `ppo_fast-residual` has the carried wrist path, the
+released observation and no shaping; and `ppo-absolute` is the paper's PPO with its actions. Each
+run is an ordinary `pgdm-run`: the same command resumes it. Two runs train at a time, one thread
+each.
 """
 
 from __future__ import annotations
