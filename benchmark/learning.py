@@ -39,6 +39,7 @@ FRAMES = 1_000_000
 EARLY = 300_000
 """The table also shows success after this many frames."""
 
+HALF = 0.5
 QUICK6 = suite("quick6")
 EARLIER = (
     "+experiment=fast",
@@ -204,6 +205,32 @@ def means(found: list[dict[str, Any]]) -> str:
     return "".join(lines)
 
 
+def minutes(found: list[dict[str, Any]]) -> str:
+    """Return each setting's minutes to half success, run by run, as a Markdown table."""
+    lines = [
+        f"Minutes until the sampled policy first has {HALF:.0%} success, one value a seed; two "
+        "runs at a time on two cores, one thread each:\n",
+        f"| setting | {' | '.join(QUICK6)} |",
+        f"|---|{'--:|' * len(QUICK6)}",
+    ]
+    for setting in SETTINGS:
+        timed = [r for r in found if r["setting"] == setting and "curve_minutes" in r]
+        cells = [", ".join(to_half(r) for r in timed if r["task"] == task) for task in QUICK6]
+        if timed:
+            lines.append(f"| {setting} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def to_half(one: dict[str, Any]) -> str:
+    """Return the minutes until a run first has half success, or that it never has it."""
+    for when, success in zip(
+        one["curve_minutes"], one["curves"]["eval_sampled/success"], strict=True
+    ):
+        if success >= HALF:
+            return f"{when:.1f}"
+    return f"not in {one['curve_minutes'][-1]:.0f}"
+
+
 def remarks(found: list[dict[str, Any]]) -> str:
     """Return notes on the table and the picture."""
     lines = []
@@ -285,7 +312,7 @@ def main() -> None:
     found = with_old_scenes([one for job in every if (one := stored(job))], scenes)
     (RESULTS / "README.md").write_text(
         f"# {len(found)} of {len(every)} runs\n\n`python benchmark/learning.py`\n\n"
-        f"{means(found)}\n{remarks(found)}{table(found)}"
+        f"{means(found)}\n{minutes(found)}\n{remarks(found)}{table(found)}"
     )
     plot(found, RESULTS / "curves.png")
     print(means(found), table(found), sep="\n")

@@ -97,6 +97,15 @@ def test_old_scenes_are_marked_and_in_no_mean_and_missing_times_are_told() -> No
     assert learning.remarks(found[1:2]) == ""
 
 
+def test_minutes_to_half_success() -> None:
+    one = result("cup-pour1", 0.0)
+    one["curve_minutes"], one["curves"] = [0.1, 2.0, 4.0], {"eval_sampled/success": [0.0, 0.5, 0.4]}
+    assert learning.to_half(one) == "2.0"
+    one["curves"]["eval_sampled/success"][1] = 0.49
+    assert learning.to_half(one) == "not in 4"
+    assert "| fast |  | not in 4 |  |" in learning.minutes([one, result("door-open", 0.9)])
+
+
 def test_an_experiment_is_trained_anew_when_its_settings_have_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
