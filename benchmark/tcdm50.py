@@ -21,6 +21,7 @@ from pgdm.config.identity import identity_hash
 from pgdm.config.saved import load_config
 from pgdm.config.schema import ExperimentCfg
 from pgdm.config.suites import suite
+from pgdm.report.results import paper
 from pgdm.runs.files import RESULT, read_json
 from pgdm.runs.folder import RunFolder, find_runs
 from pgdm.runs.result import WRIST_BOUND
@@ -61,19 +62,25 @@ def wanted(found: RunFolder) -> bool:
     return read_json(before / RESULT)["frames"] < found.result["frames"]
 
 
+def nothing(task: str) -> float:
+    """Return the success of an object that never moves from where the motion starts."""
+    return float(paper()["null_policy"][task])
+
+
 def table(rows: dict[Path, dict[str, Any]]) -> str:
     """Return stored results as a Markdown table, worst first."""
     lines = [
         "| task | seed | frames | minutes | success, sampled | deterministic | lifted "
-        "| rigid grasp | paper | settings |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|--:|---|",
+        "| rigid grasp | doing nothing | paper | settings |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|---|",
     ]
     for folder, row in sorted(rows.items(), key=lambda r: r[1]["metrics"]["eval_sampled/success"]):
         cfg, metrics = load_config(folder), row["metrics"]
         cells = [
             metrics.get(f"eval_{kind}") for kind in ("sampled/success", "deterministic/success")
         ]
-        cells += [metrics.get("eval_sampled/lifted"), row.get(WRIST_BOUND), cfg.task.paper_success]
+        cells += [metrics.get("eval_sampled/lifted"), row.get(WRIST_BOUND), nothing(cfg.task.id)]
+        cells.append(cfg.task.paper_success)
         shown = " | ".join("-" if value is None else f"{value:.1%}" for value in cells)
         lines.append(
             f"| {cfg.task.id} | {cfg.seed} | {row['frames']:,} | {row['wall_time_s'] / 60:.0f} "
@@ -107,6 +114,7 @@ def main() -> None:
             f"# {title}\n\n`+experiment=fast`; not comparable with the paper (50,000,000 "
             "frames, 3 seeds). Rigid grasp: what a grasp that never slips would reach with the "
             "planned commands. "
+            "Doing nothing: success if the object never moves. "
             "Settings: earlier, if `+experiment=fast` was changed since the run. "
             f"Page, curves and tables are in `report`.\n\n{table(rows)}"
         )
