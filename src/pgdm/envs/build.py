@@ -26,7 +26,7 @@ from pgdm.pregrasp.sources import PregraspCfg, start_state
 from pgdm.sim.batch import SimBatch
 from pgdm.sim.randomize import Randomizer
 from pgdm.sim.scene import WARP, HandCfg, Scene, SimCfg, TaskCfg, build_scene
-from pgdm.wrist.plan import WristPlan, WristProblem
+from pgdm.wrist.plan import WristPlan, WristProblem, shortcoming
 
 TRAIN = "train"
 """Random stream of the simulations that a policy is trained in."""
@@ -127,6 +127,8 @@ class EnvBuilder:
                 f"starting from '{used}' ('pgdm pregrasp reach {task}' plans one)"
             )
         if (note := self._away_from_target()) is not None:
+            notes.append(note)
+        if self.wrist is not None and (note := shortcoming(self.wrist_problem, self.wrist)):
             notes.append(note)
         unknown = ", ".join(name for name in self.scene.task.objects if name not in RATIOS)
         if unknown and self._cfg.sim.object_mass == "published":

@@ -87,7 +87,9 @@ def clipped_path(index: SceneIndex, reference: ObjectReference, start: Tensor) -
 def feasible_path(index: SceneIndex, reference: ObjectReference, start: Tensor) -> Tensor:
     """Return base joint positions (T, 6), within the control ranges, that follow the motion.
 
-    The grasp point is on target, or as near to it as the ranges allow.
+    The grasp point is on target, or as near to it as the ranges allow. Joint ranges are not known
+    here: they may end earlier (the third slide of D'Hand and D'Manus stops at -0.1 m, its control
+    range is -0.3 to 0.5 m). The planner passes an index narrowed to both, see `pgdm.wrist.search`.
 
     With x the target position in the mount's frame, o the grasp point in the mount body's frame, a
     the three hinge angles and R(a) their rotation, the slides follow from the hinges:

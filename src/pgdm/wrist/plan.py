@@ -11,13 +11,15 @@ import numpy as np
 from pgdm.library.progress import StepProgress, silent
 from pgdm.sim.scene import hand_alone
 from pgdm.wrist.hand import HandAlone
+from pgdm.wrist.path import BASE_JOINTS, SLIDES
 from pgdm.wrist.problem import WristProblem
 from pgdm.wrist.search import REAL_STAGE, SMOOTH_STAGE, Search
 
-__all__ = ["WristPlan", "WristProblem", "plan_wrist", "simulate"]
+__all__ = ["WristPlan", "WristProblem", "plan_wrist", "shortcoming", "simulate"]
 
 NEAR_M = 0.01
 """A step counts towards the rigid grasp if its error is at most this; same limit as for success."""
+_AT_END = np.repeat((0.01, 0.06), SLIDES)  # m and rad: this near to an end of the range
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,36 @@ def plan_wrist(
         commands = search.improve(commands, stage, real)
     seconds = time.monotonic() - began
     return replace(simulate(problem, commands), frames=search.frames, seconds=seconds)
+
+
+def shortcoming(problem: WristProblem, plan: WristPlan) -> str | None:
+    """Return a sentence if a plan follows its motion only in part, else None.
+
+    That is, if the hand alone is more than 1 cm off on average after hold and catch-up. The
+    sentence names base joints that are commanded to an end of their range in at least half of the
+    steps with more than 1 cm of error, and those that start beyond their range.
+    """
+    late = slice(2 * problem.hold_steps, None)
+    if plan.error_m[late].mean() <= NEAR_M:
+        return None
+    model, index = problem.scene.model, problem.scene.index
+    low, high = model.jnt_range[:BASE_JOINTS].T
+    commands = plan.commands[late][plan.error_m[late] > NEAR_M]
+    at_low = commands <= np.maximum(low, index.ctrl_low[:BASE_JOINTS]) + _AT_END
+    at_high = commands >= np.minimum(high, index.ctrl_high[:BASE_JOINTS]) - _AT_END
+    start = problem.qpos[:BASE_JOINTS]
+    which = {
+        "joints commanded to an end of their range": (at_low | at_high).mean(axis=0) >= 0.5,
+        "joints that start beyond their range": np.maximum(low - start, start - high) > _AT_END,
+    }
+    text = (
+        f"the base cannot follow the whole motion of '{problem.scene.task.id}': rigid grasp "
+        f"{plan.rigid_grasp:.0%}, the hand alone {1e3 * plan.error_m.mean():.0f} mm off on average"
+    )
+    for what, joint in which.items():
+        if joint.any():
+            text += f"; {what}: " + ", ".join(model.joint(i).name for i in np.flatnonzero(joint))
+    return text
 
 
 def simulate(problem: WristProblem, commands: np.ndarray) -> WristPlan:
