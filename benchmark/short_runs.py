@@ -18,7 +18,7 @@ from pgdm.runs.log import RunLog, metrics_of
 
 AT_A_TIME = 2
 TRAIN_POINTS = 40
-TRAINED = ("train/return", "train/success", "train/lifted")
+TRAINED = ("train/return", "train/shaping", "train/success", "train/lifted")
 
 
 @dataclass(frozen=True)

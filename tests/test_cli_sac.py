@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from command_line import TINY, TINY_SAC, Outcome, command
+from command_line import TINY, TINY_SAC, Outcome, command, unchanged
 from pgdm.config.compose import compose
 from pgdm.errors import CheckpointError
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
+from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.runs.files import read_json
+from pgdm.runs.log import Record, RunLog
+from test_rl_resume import flat
 
+FAST = (
+    *("+experiment=fast", "task=duck-lift", "algo.updates_per_step=1"),
+    *("total_frames=64", "keep_replay=true"),
+)
+"""Long enough for training to complete an episode, of 20 steps."""
 FILES = {"observation", "action", "terms", "discount", "terminated", "next_observation"}
 
 
@@ -143,6 +153,30 @@ def test_a_replay_that_was_lost_halfway_is_told(library_home: Path, tmp_path: Pa
     assert not (folder / "replay").exists()
 
 
+@pytest.mark.parametrize("other", [None, "duck-lift", "dmanus-crackerbox"])
+def test_a_replay_that_was_cut_or_is_of_another_task_is_refused(
+    other: str | None, library_home: Path, tmp_path: Path
+) -> None:
+    """The observations of duck-lift are as long as those of the run, D'Manus' are not."""
+    mine, theirs = (tmp_path / run / "replay" for run in ("run", "other"))
+    assert sac_run("keep_replay=true").code == 0
+    if other is None:
+        os.truncate(mine / "next_observation.bin", 1000)
+    else:
+        assert sac_run("keep_replay=true", f"task={other}", "run_dir=other").code == 0
+        same = [(folder / "observation.bin").stat().st_size for folder in (mine, theirs)]
+        assert (len(set(same)) == 1) is (other == "duck-lift")
+        shutil.rmtree(mine)
+        shutil.copytree(theirs, mine)
+    with unchanged(tmp_path / "run"):
+        refused = sac_run("keep_replay=true", "total_frames=64")
+    assert refused.code == 1
+    [error] = refused.errors
+    assert "replay in run/replay does not hold the 32 frames of the checkpoint" in error
+    assert "restore it, or start anew in another run_dir" in error
+    assert "Traceback" not in refused.err
+
+
 def test_a_start_that_is_refused_leaves_the_replay_as_it_was(
     library_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -163,3 +197,55 @@ def test_a_start_that_is_refused_leaves_the_replay_as_it_was(
     monkeypatch.setattr("pgdm.experiment.check_assets", refuse)
     monkeypatch.setattr("pgdm.experiment._trainer", lambda *_: pytest.fail("too early"))
     assert "another network" in sac_run("total_frames=64").errors[0]
+
+
+def records(run: Path, kind: str) -> list[Record]:
+    return [line for line in RunLog(run / "metrics.jsonl").read() if line["kind"] == kind]
+
+
+def replayed_terms(run: Path) -> dict[str, np.ndarray]:
+    """Return the reward terms of all frames of a replay, unweighted."""
+    about = read_json(run / "replay" / "columns.json")["terms"]
+    stored = np.fromfile(run / "replay" / about["file"], about["dtype"])
+    return dict(zip(about["entries"], stored.reshape(-1, len(about["entries"])).T, strict=True))
+
+
+@pytest.mark.usefixtures("expert_home")
+@pytest.mark.parametrize(
+    ("setting", "added"),
+    [
+        ("method=deepmimic", {"imitation", "grasp"}),
+        ("method=graff", {"contact", "grasp"}),
+        ("pregrasp=none", set()),
+        ("ablation=distance_15cm", set()),
+    ],
+)
+def test_fast_has_the_terms_of_methods_and_no_grasp_term_without_a_pregrasp(
+    setting: str, added: set[str], tmp_path: Path
+) -> None:
+    outcome = sac_run(*FAST, setting)
+    assert (outcome.code, outcome.errors) == (0, [])
+    run, terms = tmp_path / "run", {"tracking", "lift"} | added
+    for kind, expected in (("train", terms), ("eval", terms - {"grasp"})):
+        names = {name for line in records(run, kind) for name in line}
+        assert {name.split("/")[-1] for name in names if "/raw/" in name} == expected
+    replayed = replayed_terms(run)
+    assert set(replayed) == terms
+    assert all(replayed[name].any() for name in ("tracking", *added))
+
+
+@pytest.mark.usefixtures("expert_home")
+def test_a_curriculum_keeps_unweighted_terms_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    ramp = (*FAST, "method=curriculum", "method.curriculum.ramp_frames=64")
+    learners = []
+    for name, lengths in (("straight", (48,)), ("stopped", (32, 48))):
+        for frames in lengths:
+            assert sac_run(*ramp, f"total_frames={frames}", f"run_dir={name}").code == 0
+        run = tmp_path / name
+        weights = [line["train/weight/tracking"] for line in records(run, "train")]
+        assert weights == [0.0, 2.5, 5.0]
+        assert replayed_terms(run)["tracking"][:16].all()  # seen while the weight was 0
+        state = CheckpointFolder(run / "checkpoints", 2).latest()
+        assert state is not None
+        learners.append(flat(state["learner"]))
+    assert learners[0] == learners[1]

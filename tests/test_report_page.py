@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import short_runs
 from PIL import Image
 
 from pgdm.cli.main import main
 from pgdm.errors import RunError
 from pgdm.report import statistics
 from pgdm.report.page import write_report
-from report_runs import make, report, rows, text_of
+from report_runs import FRAMES, make, report, rows, text_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 CSVS = ["averages", "curves", "profiles", "runs", "statistics", "tasks"]
@@ -165,6 +166,30 @@ def test_the_papers_own_runs_are_comparable(tmp_path: Path) -> None:
     assert "cup-pour1 70.0% 83.1% -13.1 0.0%" in text
     assert "Not the paper's budget" not in text
     assert rows("tasks")[0]["comparable_with_paper"] == "yes"
+
+
+def test_what_training_added_is_told_with_its_sum_also_of_stored_runs(tmp_path: Path) -> None:
+    grasp, soft = ({"shaping": words} for words in ("exp(-d/0.1 m) is added", "rewards are scaled"))
+    for seed, added in enumerate((40.0, 50.0)):
+        settings = ("task=cup-pour1", "shaping=grasp", f"seed={seed}")
+        run = make(tmp_path / "made" / f"{seed}", 0.7, *settings, result=grasp)
+        for share, more in ((0.5, 900.0), (0.95, added - 2), (1.0, added + 2)):
+            metrics = {"train/return": 100.0, "train/shaping": more}
+            place = {"frames": round(share * FRAMES), "iteration": 9, "time_s": 9.0}
+            run.log.append(metrics, kind="train", **place)
+        short_runs.store(run, tmp_path / "kept" / "runs" / f"{seed}", tmp_path / "kept")
+    settings = ("task=cup-pour1", "shaping=soft_end")
+    make(tmp_path / "made" / "soft", 0.7, *settings, result=soft)
+    make(tmp_path / "made" / "plain", 0.7, "task=cup-pour1")
+    never = "In training only, never in evaluations:"
+    sums = "the added rewards sum to 45.0 per episode in the last tenth of the training, the task's"
+    told = f"{never} {grasp['shaping']}. This is so in pgdm, shaping=grasp ({sums} own to 100.0)."
+    also = f"{never} {soft['shaping']}. This is so in pgdm, shaping=soft_end."
+    for folder, sentences in (("made", [told, also]), ("kept", [told])):
+        text = text_of(report(tmp_path / folder))
+        assert [sentence in text for sentence in sentences] == [True] * text.count(never)
+        trained = {row["train/shaping"] for row in rows("curves") if row["kind"] == "train"}
+        assert {"38", "42", "48", "52", "900"} <= trained
 
 
 def test_nothing_has_finished_yet(tmp_path: Path) -> None:

@@ -14,15 +14,18 @@ from typing import Any
 import pytest
 
 import slurm_cluster
-from command_line import TINY, command, process
+from command_line import TINY, TINY_SAC, command, process
+from pgdm.config.compose import compose
+from pgdm.rl.checkpoint import CheckpointFolder
 from pgdm.runs.files import read_json
 from pgdm.runs.log import RunLog
 from pgdm.sweep.ledger import Ledger
-from pgdm.sweep.plan import Plan, write_plan
+from pgdm.sweep.plan import Job, Plan, job_key, write_plan
 from pgdm.sweep.queue import parse
 from pgdm.sweep.status import log_path, parent, rows
-from slurm_cluster import output
+from slurm_cluster import NODES, output
 from sweep_plans import SLURM, broken, plan, start
+from test_rl_resume import flat
 
 pytestmark = [
     pytest.mark.slow,
@@ -160,6 +163,16 @@ def held(node: str, folder: Path, driver: Driver | None, count: int = JOBS) -> d
             return stopped
 
 
+def preempt(node: str, folder: Path, driver: Driver) -> None:
+    """Submit a job of higher priority that needs all of a node, and wait until it is done."""
+    other = output(
+        *("sbatch", "--parsable", "--partition=hi", f"--nodelist={node}", "--exclusive"),
+        *("--output=/dev/null", "--wrap=sleep 4"),
+    ).strip()
+    OTHERS.add(other)
+    until(lambda _: standings()[other] == "COMPLETED", folder, driver)
+
+
 def test_whatever_slurm_does_each_job_is_done_once(
     folder: Path, drive: Callable[[Plan], Driver]
 ) -> None:
@@ -181,12 +194,7 @@ def test_whatever_slurm_does_each_job_is_done_once(
 
     # Somebody else's jobs come first.
     preempted = held("n1", folder, driver)
-    other = output(
-        *("sbatch", "--parsable", "--partition=hi", "--nodelist=n1", "--exclusive"),
-        *("--output=/dev/null", "--wrap=sleep 4"),
-    ).strip()
-    OTHERS.add(other)
-    until(lambda _: standings()[other] == "COMPLETED", folder, driver)
+    preempt("n1", folder, driver)
     until(lambda _: restarts(late[name]), folder, driver)
     output("scontrol", "update", f"jobid={late[name]}", "TimeLimit=60")
 
@@ -226,6 +234,30 @@ def test_whatever_slurm_does_each_job_is_done_once(
         trained = [line["frames"] for line in lines if line["kind"] == "train"]
         assert trained == list(range(STEP, job.cfg.total_frames + 1, STEP))
         assert read_json(run / "result.json")["status"] == "finished"
+
+
+def test_a_preempted_job_goes_on_with_its_replay(
+    folder: Path, drive: Callable[[Plan], Driver], tmp_path: Path
+) -> None:
+    settings = (*TINY_SAC, *LONG, "offline=true", "seed=0", "total_frames=1280")
+    cfg = compose([*settings, f"run_dir={folder / 'runs' / 's0'}"])
+    job = Job(job_key(cfg), "seed=0", settings, cfg)
+    driver = drive(Plan(folder.name, folder, (job,), "pgdm-run -m seed=0"))
+    until(lambda _: any(on_node(node, folder) for node in NODES), folder, driver)
+    (node,) = (node for node in NODES if on_node(node, folder))
+    slurm_id = held(node, folder, driver)["seed=0"]
+    preempt(node, folder, driver)
+    until(lambda _: driver.poll() is not None, folder)
+    assert driver.returncode == 0, Path("driver.txt").read_text()
+    assert restarts(slurm_id) == 1
+    log = log_path(folder, "seed=0", 1).read_text()
+    assert "SIGTERM: saving" in log and "resuming" in log
+    assert command("pgdm-run", *settings, "run_dir=straight").code == 0
+    learners = [
+        flat((CheckpointFolder(run / "checkpoints", 2).latest() or {})["learner"])
+        for run in (folder / "runs" / "s0", tmp_path / "straight")
+    ]
+    assert learners[0] == learners[1]
 
 
 def test_a_failed_job_ctrl_c_and_cancel(folder: Path, drive: Callable[[Plan], Driver]) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import shutil
 import sqlite3
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from command_line import TINY_SAC, command
 from fake_runs import (
     LENGTH,
     STEP,
@@ -23,6 +25,7 @@ from fake_runs import (
     make,
     train,
     train_metrics,
+    truth,
 )
 from pgdm.errors import UnknownNameError
 from pgdm.runs.config_file import as_text, dotted
@@ -167,6 +170,33 @@ def test_resumed_run_goes_on_in_its_own(tmp_path: Path) -> None:
     assert {step for step, _ in steps(store, first["run_id"], "train/return")} == {
         i * STEP for i in range(1, 11)
     }
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("library_home")
+def test_an_off_policy_run_goes_on_in_its_own_and_its_replay_stays_here(tmp_path: Path) -> None:
+    settings = ("--offline", *TINY_SAC, "task=duck-lift", "shaping=grasp", "tracking.kind=mlflow")
+    for frames in (32, 64):  # the second completes an episode, of 20 steps
+        lengths = ("keep_replay=true", f"total_frames={frames}", "run_dir=runs/a")
+        outcome = command("pgdm-run", *settings, *lengths)
+        assert (outcome.code, outcome.errors) == (0, [])
+    folder = RunFolder(tmp_path / "runs" / "a")
+    assert (folder.path / "replay" / "action.bin").is_file()
+    store, link = Store.open(store_uri(tmp_path / "runs"), "pgdm"), read_json(folder.path / LINK)
+    run = store.client.get_run(link["run_id"])
+    assert (link["attempts"], run.info.status) == (2, "FINISHED")
+    assert run.info.run_name == "duck-lift s0 pgdm sac absolute"
+    recorded = {
+        name: known
+        for name, values in truth(folder).items()
+        if (known := {step: value for step, value in values.items() if math.isfinite(value)})
+    }
+    assert {"train/loss_critic", "train/temperature", "train/shaping"} <= set(recorded)
+    assert set(run.data.metrics) == set(recorded)
+    for name, values in recorded.items():
+        assert dict(steps(store, link["run_id"], name)) == values
+    top = {item.path for item in store.client.list_artifacts(link["run_id"])}
+    assert "checkpoints" in top and "replay" not in top
 
 
 def test_resumed_run_without_its_store_brings_its_records_along(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pgdm.report.results import Results
-from pgdm.report.runs import METRICS, RETURN
+from pgdm.report.runs import METRICS, RETURN, SHAPING
 from pgdm.report.settings import Setting
 from pgdm.report.statistics import Estimate
 from pgdm.report.tables import THRESHOLDS, Average, Improvement
@@ -109,18 +109,19 @@ def statistics(results: Results, found: Aggregates, better: Improvements, out: P
 
 
 def curves(results: Results, out: Path) -> None:
-    """Write ``curves.csv``: every evaluation, and the training return, thinned."""
-    table = []
+    """Write ``curves.csv``: every evaluation, and return and shaping in training, thinned."""
+    table, trained = [], (RETURN, SHAPING)
     for run in results.runs:
         who = [run.task, results.labels[run.setting], run.seed]
         columns = [run.evaluations[name].tolist() for name in ("frames", *METRICS)]
         for frames, *values in zip(*columns, strict=True):
-            table.append([*who, "eval", int(frames), *values, ""])
+            table.append([*who, "eval", int(frames), *values, *[""] * len(trained)])
         if run.training:
-            pairs = zip(run.training["frames"].tolist(), run.training[RETURN].tolist(), strict=True)
+            columns = [run.training[name].tolist() for name in ("frames", *trained)]
             blank = [""] * len(METRICS)
-            table += [[*who, "train", int(frames), *blank, value] for frames, value in pairs]
-    head = ["task", "setting", "seed", "kind", "frames", *METRICS, RETURN]
+            for frames, *values in zip(*columns, strict=True):
+                table.append([*who, "train", int(frames), *blank, *values])
+    head = ["task", "setting", "seed", "kind", "frames", *METRICS, *trained]
     _write(out / "curves.csv", head, table)
 
 

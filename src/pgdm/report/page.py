@@ -20,6 +20,7 @@ from pgdm.config.compose import PAPER_FRAMES
 from pgdm.errors import RunError, amount
 from pgdm.library.progress import StepProgress, counted
 from pgdm.report import alike, export, figures, mean_curves, tables
+from pgdm.report.additions import additions
 from pgdm.report.curves import curves
 from pgdm.report.results import Results, paper
 from pgdm.report.runs import ERROR, SUCCESS
@@ -94,6 +95,7 @@ def _context(
         "budgets": Counter(run.budget for run in results.runs),
         "shared": shared(results.settings),
         "deviations": {s: results.deviations(s) for s in results.settings},
+        "additions": additions(results),
         "colours": {s: figures.colour(results, s) for s in results.settings},
         "averages": averages,
         "apart": {t: mean_curves.apart(results, averages[t]) for t in ("ablation", "baseline")},

@@ -40,6 +40,8 @@ METRICS = (
     CONTACTS,
 )
 RETURN = "train/return"
+SHAPING = "train/shaping"
+"""Sum of the rewards that training adds to an episode; only runs with such rewards record it."""
 MISSING = "missing"
 """State of a run that a sweep has planned but not started."""
 STATES = ("finished", "running", "interrupted", "failed", MISSING)
@@ -73,7 +75,8 @@ class Run:
     evaluations: Curve
     """``frames`` and each of ``METRICS``, arrays of shape (E,) for E evaluations."""
     training: Curve
-    """``frames`` and ``RETURN``, arrays of about ``TRAIN_POINTS`` values; may be empty."""
+    """``frames``, ``RETURN`` and ``SHAPING``, arrays of about ``TRAIN_POINTS`` values; may be
+    empty."""
     video: Path | None
     """The last video; its poster is the PNG of the same name."""
     modified: float
@@ -111,7 +114,7 @@ def read_run(folder: RunFolder) -> Run:
         frames=int(folder.result.get("frames", last)),
         metrics=dict(stored) or (metrics_of(evaluations[-1]) if evaluations else {}),
         evaluations=_curve(evaluations, METRICS),
-        training=_curve(trained, (RETURN,)),
+        training=_curve(trained, (RETURN, SHAPING)),
         video=max((folder.path / VIDEOS).glob("frames_*.mp4"), default=None),
     )
 

@@ -77,7 +77,8 @@ class Replay:
             data = {n: torch.zeros(capacity, *c.shape, dtype=c.dtype) for n, c in columns.items()}
         else:
             self._made = _reserve(folder, self.columns, capacity)
-            _describe(folder, self.columns)
+            if self._made:  # else the files may be another run's: see load_state_dict
+                _describe(folder, self.columns)
             data = {
                 name: MemoryMappedTensor.from_filename(
                     str(folder / f"{name}{_SUFFIX}"), c.dtype, torch.Size((capacity, *c.shape))
@@ -139,7 +140,7 @@ class Replay:
 
         Raises:
             CheckpointError: if there are more frames than the capacity, or the files do not hold
-                them. If a file was missing at the start, the files created then are deleted.
+                them. The replay is then as before: a state with fewer frames may be tried.
         """
         frames, expected = int(state["frames"]), state["crc32"]
         where = self.folder or "the memory"
@@ -149,8 +150,6 @@ class Replay:
                 f"only {self.capacity:,}; resume with more total_frames"
             )
         if frames and self._made:
-            for path in self._made:
-                path.unlink(missing_ok=True)
             raise CheckpointError(
                 f"the replay in {where} is gone (it lacks {self._made[0].name}): it is removed "
                 "when a run has finished, unless keep_replay=true; start anew in another run_dir, "
@@ -164,6 +163,8 @@ class Replay:
                     f"checkpoint (column '{name}' differs): it was cut, altered, or is of another "
                     "run; restore it, or start anew in another run_dir"
                 )
+        if self.folder is not None:
+            _describe(self.folder, self.columns)
         self._crc = {name: int(expected[name]) for name in self.columns}
         self._stored = frames
         if self._live is not self._data:
