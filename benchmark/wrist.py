@@ -119,15 +119,16 @@ def table(stored: dict[str, Any]) -> str:
     """Return the stored results as a Markdown table, lowest `planned` rigid grasp first."""
     lines = [
         "| task | steps | `clipped`, `feasible`: mean [mm] | `planned`: mean, largest [mm] "
-        "| rigid grasp | with the hold | paper | untrained return: `carried`, `planned` |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|",
+        "| rigid grasp | with the hold | frames | paper | untrained return: `carried`, `planned` |",
+        "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for task, row in sorted(stored.items(), key=lambda item: item[1]["planned"]["bound"]):
-        free, paper = row["planned"], row["paper_success"]
+        free, held, paper = row["planned"], row["held"], row["paper_success"]
         lines.append(
             f"| {task} | {row['steps']} | {row['clipped_mm']}, {row['feasible_mm']} "
             f"| {free['mean_mm']}, {free['max_mm']} | {free['bound']:.1%} "
-            f"| {row['held']['bound']:.1%} | {'' if paper is None else f'{paper:.1%}'} "
+            f"| {held['bound']:.1%} | {held['frames']:,} "
+            f"| {'' if paper is None else f'{paper:.1%}'} "
             f"| {row['untrained']['carried']:.0f}, {row['untrained']['planned']:.0f} |"
         )
     return "\n".join(lines)

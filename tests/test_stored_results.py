@@ -18,6 +18,7 @@ BENCHMARK = Path(__file__).resolve().parents[1] / "benchmark"
 sys.path.insert(0, str(BENCHMARK))
 import methods  # noqa: E402 (benchmark/ is no package: each file is a program)
 import study  # noqa: E402
+import wrist  # noqa: E402
 
 
 @pytest.mark.parametrize("setting", study.SETTINGS)
@@ -42,3 +43,8 @@ def test_tables_of_stored_results_are_current() -> None:
         for setting in methods.settings(methods.FRAMES)
     ]
     assert methods.table(found) in (methods.RESULTS / "README.md").read_text()
+
+
+def test_the_table_of_wrist_plans_is_current() -> None:
+    page = (BENCHMARK.parent / "docs" / "wrist.md").read_text()
+    assert wrist.table(json.loads(wrist.RESULTS.read_text())) in page
