@@ -97,6 +97,15 @@ def test_old_scenes_are_marked_and_in_no_mean_and_missing_times_are_told() -> No
     assert learning.remarks(found[1:2]) == ""
 
 
+def test_ppo_is_compared_with_everything_else_as_in_fast() -> None:
+    fast, ppo = (
+        compose(["task=hammer-use1", *learning.SETTINGS[name]])
+        for name in ("fast", "ppo_fast-planned")
+    )
+    assert ppo.algo.name == "ppo_fast"
+    assert (ppo.obs, ppo.action, ppo.shaping) == (fast.obs, fast.action, fast.shaping)
+
+
 def test_minutes_to_half_success() -> None:
     one = result("cup-pour1", 0.0)
     one["curve_minutes"], one["curves"] = [0.1, 2.0, 4.0], {"eval_sampled/success": [0.0, 0.5, 0.4]}

@@ -48,3 +48,8 @@ def test_tables_of_stored_results_are_current() -> None:
 def test_the_table_of_wrist_plans_is_current() -> None:
     page = (BENCHMARK.parent / "docs" / "wrist.md").read_text()
     assert wrist.table(json.loads(wrist.RESULTS.read_text())) in page
+
+
+def test_the_page_on_learning_shows_the_stored_curves() -> None:
+    shown = BENCHMARK.parent / "docs" / "images" / "learning.png"
+    assert shown.read_bytes() == (BENCHMARK / "results" / "learning" / "curves.png").read_bytes()
