@@ -113,6 +113,11 @@ def test_a_motion_out_of_reach_is_told_with_the_joints_that_end(
     assert told is not None and "\n" not in told
     assert re.search(r"rigid grasp \d\d%, the hand alone \d+ mm off .*: adroit/.*ARTz$", told)
     assert shortcoming(problem, plan) is None
+    model = copy.deepcopy(problem.scene.model)
+    model.jnt_limited[0], model.jnt_range[0] = 0, 0.0
+    free = replace(beyond, scene=replace(problem.scene, model=model))
+    still = shortcoming(free, replace(plan, error_m=plan.error_m + 0.05))
+    assert still is not None and "beyond" not in still
 
 
 def test_the_number_of_threads_changes_nothing(problem: WristProblem, plan: WristPlan) -> None:

@@ -13,7 +13,7 @@ from pgdm.sim.scene import hand_alone
 from pgdm.wrist.hand import HandAlone
 from pgdm.wrist.path import BASE_JOINTS, SLIDES
 from pgdm.wrist.problem import WristProblem
-from pgdm.wrist.search import REAL_STAGE, SMOOTH_STAGE, Search
+from pgdm.wrist.search import REAL_STAGE, SMOOTH_STAGE, Search, base_ranges
 
 __all__ = ["WristPlan", "WristProblem", "plan_wrist", "shortcoming", "simulate"]
 
@@ -94,7 +94,7 @@ def shortcoming(problem: WristProblem, plan: WristPlan) -> str | None:
     if plan.error_m[late].mean() <= NEAR_M:
         return None
     model, index = problem.scene.model, problem.scene.index
-    low, high = model.jnt_range[:BASE_JOINTS].T
+    low, high = base_ranges(model).T
     commands = plan.commands[late][plan.error_m[late] > NEAR_M]
     at_low = commands <= np.maximum(low, index.ctrl_low[:BASE_JOINTS]) + _AT_END
     at_high = commands >= np.minimum(high, index.ctrl_high[:BASE_JOINTS]) - _AT_END

@@ -79,6 +79,12 @@ SMOOTH_STAGE, REAL_STAGE = Stage(15, 0.3), Stage(8, 0.03)
 mislead the search; the second simulates with them."""
 
 
+def base_ranges(model: mujoco.MjModel) -> np.ndarray:
+    """Return the ranges (6, 2) of the base joints, m and rad; infinite if a joint has no limits."""
+    limited = model.jnt_limited[:, None]
+    return np.where(limited, model.jnt_range, (-np.inf, np.inf))[:BASE_JOINTS]
+
+
 class Search:
     """Search for the wrist plan of one problem.
 
@@ -93,8 +99,7 @@ class Search:
         # `frames`: control steps simulated so far.
         self._progress, self._rounds, self.frames = progress, 0, 0
         model, index = scene.model, scene.index
-        limited = model.jnt_limited[:, None]
-        ranges = np.where(limited, model.jnt_range, (-np.inf, np.inf))[:BASE_JOINTS]
+        ranges = base_ranges(model)
         margin = np.minimum(_MARGIN, np.ptp(ranges, axis=1) / 4)
         self._low, self._high = index.ctrl_low[:BASE_JOINTS], index.ctrl_high[:BASE_JOINTS]
         self._limits = Limits(ranges[:, 0] + margin, ranges[:, 1] - margin)
