@@ -78,8 +78,8 @@ def test_the_additions_are_described_in_words() -> None:
     assert NO_SHAPING.described() == ""
     described = replace(NO_SHAPING, kernel_weight=5.0, soft_end_m=0.15).described()
     assert described == (
-        "with the object error e, 5 exp(-e/0.1 m) is added to the reward and "
-        "future rewards are scaled by exp(-(e/0.15 m)^2)"
+        "5 exp(-e/0.1 m) is added to the reward (e: the object's error), and "
+        "future rewards are scaled by exp(-(e/0.15 m)^2) (e: the object's error)"
     )
     assert "3 exp(-d/0.05 m), averaged over" in replace(NO_SHAPING, grasp_weight=3.0).described()
 
@@ -100,7 +100,7 @@ def test_a_result_records_the_additions_only_if_there_are_any(tmp_path: Path) ->
         assert outcome.code == 0, outcome.err
     assert "shaping" not in read_json(tmp_path / "bare" / "result.json")
     recorded = read_json(tmp_path / "shaped" / "result.json")["shaping"]
-    assert recorded.endswith("5 exp(-e/0.1 m) is added to the reward")
+    assert recorded == "5 exp(-e/0.1 m) is added to the reward (e: the object's error)"
 
 
 @pytest.mark.parametrize(

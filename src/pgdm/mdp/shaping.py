@@ -57,17 +57,22 @@ class ShapingCfg:
         parts = []
         if self.kernel_weight:
             width_m = 1 / self.kernel_scale
-            parts.append(f"{self.kernel_weight:g} exp(-e/{width_m:.3g} m) is added to the reward")
+            parts.append(
+                f"{self.kernel_weight:g} exp(-e/{width_m:.3g} m) is added to the reward "
+                "(e: the object's error)"
+            )
         if self.grasp_weight:
             width_m = 1 / self.grasp_scale
             parts.append(
                 f"{self.grasp_weight:g} exp(-d/{width_m:.3g} m), averaged over the fingertips, is "
-                "added, with d how far each has moved on the object since the pre-grasp"
+                "added to the reward (d: how far each has moved on the object since the pre-grasp)"
             )
         if self.soft_end_m is not None:
-            parts.append(f"future rewards are scaled by exp(-(e/{self.soft_end_m:g} m)^2)")
-        what = " and ".join(parts)
-        return f"with the object error e, {what}" if parts else ""
+            parts.append(
+                f"future rewards are scaled by exp(-(e/{self.soft_end_m:g} m)^2) "
+                "(e: the object's error)"
+            )
+        return ", and ".join(parts)
 
     def validate(self) -> None:
         """Check the numbers.
