@@ -10,6 +10,9 @@ runs of `+experiment=fast` are stored.
 from __future__ import annotations
 
 import argparse
+import re
+from collections.abc import Iterable
+from math import isnan, nan
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -27,7 +30,10 @@ from pgdm.runs.folder import RunFolder, find_runs
 from pgdm.runs.result import WRIST_BOUND
 
 RESULTS = Path(__file__).parent / "results" / "tcdm50"
+PAGE = Path(__file__).parent.parent / "docs" / "tcdm50.md"
+PICTURE = PAGE.parent / "images" / "tcdm50.png"
 TASKS = suite("tcdm50")
+SUCCESS, LIFTED = "eval_sampled/success", "eval_sampled/lifted"
 
 
 def place(task: str, seed: int) -> Path:
@@ -74,7 +80,7 @@ def table(rows: dict[Path, dict[str, Any]]) -> str:
         "| rigid grasp | doing nothing | paper | settings |",
         "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|---|",
     ]
-    for folder, row in sorted(rows.items(), key=lambda r: r[1]["metrics"]["eval_sampled/success"]):
+    for folder, row in sorted(rows.items(), key=lambda r: r[1]["metrics"][SUCCESS]):
         cfg, metrics = load_config(folder), row["metrics"]
         cells = [
             metrics.get(f"eval_{kind}") for kind in ("sampled/success", "deterministic/success")
@@ -89,6 +95,78 @@ def table(rows: dict[Path, dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def by_task(rows: dict[Path, dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the results with today's settings of each task, best task first."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for folder, row in rows.items():
+        if current(cfg := load_config(folder)):
+            found.setdefault(cfg.task.id, []).append(row)
+    return dict(sorted(found.items(), key=lambda item: -mean_of(item[1], SUCCESS)))
+
+
+def mean_of(rows: Iterable[dict[str, Any]], metric: str) -> float:
+    """Return the mean of a metric over results, NaN if none has it (a door has no ``lifted``)."""
+    values = [row["metrics"][metric] for row in rows if metric in row["metrics"]]
+    return mean(values) if values else nan
+
+
+def task_table(tasks: dict[str, list[dict[str, Any]]]) -> str:
+    """Return the results of `by_task` as a Markdown table, and their means by pre-grasp source."""
+    lines = [
+        "| task | success | each seed | lifted | rigid grasp | doing nothing | paper |",
+        "|---|--:|--:|--:|--:|--:|--:|",
+    ]
+    groups: dict[str, list[tuple[float, ...]]] = {}
+    for task, rows in tasks.items():
+        cfg = compose([f"task={task}"]).task
+        bound = rows[0].get(WRIST_BOUND, nan)
+        cells = (mean_of(rows, SUCCESS), bound, nothing(task), cfg.paper_success)
+        for group in ("all", cfg.pregrasp_source):
+            groups.setdefault(group, []).append(cells)
+        seeds = ", ".join(f"{row['metrics'][SUCCESS]:.1%}" for row in rows)
+        lines.append(_line(task, cells, seeds if len(rows) > 1 else "", mean_of(rows, LIFTED)))
+    for group, of_tasks in groups.items():
+        cells = tuple(mean(column) for column in zip(*of_tasks, strict=True))
+        lines.append(_line(f"*mean, {group} ({len(of_tasks)})*", cells, "", nan))
+    return "\n".join(lines) + "\n"
+
+
+def _line(name: str, cells: tuple[float, ...], seeds: str, lifted: float) -> str:
+    success, *others = (f"{value:.1%}" for value in cells)
+    held = "-" if isnan(lifted) else f"{lifted:.0%}"
+    return f"| {name} | {success} | {seeds} | {held} | {' | '.join(others)} |"
+
+
+def draw(tasks: dict[str, list[dict[str, Any]]], file: Path) -> None:
+    """Draw each task's success beside the paper's and that of doing nothing."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 1.2 + 0.2 * len(tasks)), layout="constrained")
+    axes = figure.subplots()
+    at = range(len(tasks))
+    axes.barh(at, [mean_of(rows, SUCCESS) for rows in tasks.values()], color="#5fa8a0")
+    for row, results in zip(at, tasks.values(), strict=True):
+        seeds = [result["metrics"][SUCCESS] for result in results]
+        axes.plot(seeds, [row] * len(seeds), "|", color="#1d5c55", label="each seed")
+    paper_s = [compose([f"task={task}"]).task.paper_success for task in tasks]
+    axes.plot(paper_s, at, "D", color="#c2571a", markersize=4, label="paper, 50,000,000 frames")
+    axes.plot(
+        [nothing(t) for t in tasks], at, "x", color="grey", markersize=4, label="doing nothing"
+    )
+    axes.set(xlim=(0, 1.01), ylim=(len(tasks) - 0.4, -0.6), xlabel="success, sampled actions")
+    axes.set_yticks(at, tasks, fontsize=8)
+    axes.xaxis.set_major_formatter("{x:.0%}")
+    shown = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(shown.values(), shown, loc="outside upper center", ncols=3, fontsize=8)
+    figure.savefig(file, dpi=100)
+
+
+def stored() -> dict[Path, dict[str, Any]]:
+    """Return the stored results by folder."""
+    files = sorted((RESULTS / "runs").glob(f"*/{RESULT}"))
+    return {file.parent: read_json(file) for file in files}
+
+
 def main() -> None:
     """Store the finished runs, then report."""
     parser = argparse.ArgumentParser(
@@ -101,23 +179,22 @@ def main() -> None:
                 target = place(found.config["task"]["id"], int(found.config["seed"]))
                 store(found, target, RESULTS)
                 print(f"stored {target.name}", flush=True)
-    files = sorted((RESULTS / "runs").glob(f"*/{RESULT}"))
-    rows = {file.parent: read_json(file) for file in files}
-    tasks: dict[str, list[float]] = {}
-    for folder, row in rows.items():
-        success = row["metrics"]["eval_sampled/success"]
-        tasks.setdefault(load_config(folder).task.id, []).append(success)
-    title = f"{len(tasks)} of {len(TASKS)} tasks, {len(rows)} runs"
+    rows = stored()
+    tasks = by_task(rows)
+    title = f"{len(tasks)} of {len(TASKS)} tasks, {sum(map(len, tasks.values()))} runs"
     if rows:
-        title += f", sampled success {mean(map(mean, tasks.values())):.1%}, the mean over the tasks"
+        average = mean(mean_of(of_task, SUCCESS) for of_task in tasks.values())
+        title += f", sampled success {average:.1%}, the mean over the tasks"
         (RESULTS / "README.md").write_text(
-            f"# {title}\n\n`+experiment=fast`; not comparable with the paper (50,000,000 "
-            "frames, 3 seeds). Rigid grasp: what a grasp that never slips would reach with the "
-            "planned commands. "
-            "Doing nothing: success if the object never moves. "
-            "Settings: earlier, if `+experiment=fast` was changed since the run. "
-            f"Page, curves and tables are in `report`.\n\n{table(rows)}"
+            f"# {title}\n\n`+experiment=fast`; not comparable with the paper (50,000,000 frames, "
+            "3 seeds). The title counts runs with today's settings; those marked earlier were made "
+            "before the settings changed. Rigid grasp: what a grasp that never slips would reach "
+            "with the planned commands. Doing nothing: success if the object never moves. Page, "
+            f"curves and tables are in `report`.\n\n{table(rows)}"
         )
+        page = PAGE.read_text()
+        PAGE.write_text(re.sub(r"\| task \|.*?\n(?=\n)", task_table(tasks), page, flags=re.DOTALL))
+        draw(tasks, PICTURE)
     print(title)
     if rows and (code := report(RESULTS)):
         raise SystemExit(code)

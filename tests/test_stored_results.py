@@ -18,6 +18,7 @@ BENCHMARK = Path(__file__).resolve().parents[1] / "benchmark"
 sys.path.insert(0, str(BENCHMARK))
 import methods  # noqa: E402 (benchmark/ is no package: each file is a program)
 import study  # noqa: E402
+import tcdm50  # noqa: E402
 import wrist  # noqa: E402
 
 
@@ -48,6 +49,11 @@ def test_tables_of_stored_results_are_current() -> None:
 def test_the_table_of_wrist_plans_is_current() -> None:
     page = (BENCHMARK.parent / "docs" / "wrist.md").read_text()
     assert wrist.table(json.loads(wrist.RESULTS.read_text())) in page
+
+
+def test_the_table_of_all_tasks_is_current() -> None:
+    page = (BENCHMARK.parent / "docs" / "tcdm50.md").read_text()
+    assert tcdm50.task_table(tcdm50.by_task(tcdm50.stored())) in page
 
 
 def test_the_page_on_learning_shows_the_stored_curves() -> None:
