@@ -32,13 +32,14 @@ ALGOS: dict[str, AlgoCfg] = {
     "ppo, normalised": replace(PPO, normalize_observations=True),
     # 8 updates an iteration: the count since the policy's last update must survive too.
     "sac": replace(TOY_SAC, steps_per_env=8, warmup_steps=4, batch_size=32, actor_interval=3),
-    "sac, correlated noise, averaged": replace(
+    "sac, correlated noise, averaged, limited": replace(
         TOY_SAC,
         steps_per_env=8,
         warmup_steps=4,
         batch_size=32,
         noise_correlation=0.9,
         average_rate=0.1,
+        pre_tanh_limit=0.2,
     ),
 }
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 
 from pgdm.errors import ConfigError, RunError
 from pgdm.rl.callback import Callback, Progress
-from pgdm.rl.evaluate import Evaluator
+from pgdm.rl.evaluate import Evaluator, network_of
 from pgdm.rl.networks import ActionValue, SquashedCfg, SquashedPolicy
 from pgdm.rl.sac import SACCfg, SACLearner, columns
 from pgdm.rl.sac_loss import SoftActorCriticLoss
@@ -518,6 +518,31 @@ def test_the_lowest_of_any_number_of_critics_counts() -> None:
 def squashed(bias: Tensor | None = None, log_std: float = -1.0) -> SquashedPolicy:
     cfg = SquashedCfg("squashed", D, A, [16, 8], log_std, 10.0)
     return SquashedPolicy(cfg, torch_stream(0, "weights"), bias)
+
+
+def test_a_mean_beyond_the_limit_is_scaled_down_and_still_learns() -> None:
+    policy = squashed()  # A = 2
+    limited = SquashedPolicy(replace(policy.cfg, pre_tanh_limit=1.0), torch_stream(0, "weights"))
+    obs = torch.zeros(1, D)
+    # Average magnitude 2.5: divided by 2.5. Average magnitude 0.5: as it is.
+    for raw, expected in (([4.0, -1.0], [1.6, -0.4]), ([0.75, -0.25], [0.75, -0.25])):
+        for network, wanted in ((policy, raw), (limited, expected)):
+            with torch.no_grad():
+                network.net[-1].weight.zero_()
+                network.net[-1].bias[:2] = torch.tensor(raw)
+            mean, std = network(obs)
+            torch.testing.assert_close(mean.detach(), torch.tensor([wanted]))
+            torch.testing.assert_close(std.detach(), torch.full((1, 2), math.exp(-1.0)))
+            torch.testing.assert_close(network.mean(obs), mean.tanh())
+
+
+def test_the_limit_is_kept_in_checkpoints_and_older_ones_have_none() -> None:
+    learner = build(PointEnv(), replace(SHORT, pre_tanh_limit=0.5))
+    settings = asdict(learner.model.cfg)
+    again = network_of(settings, learner.model.state_dict())
+    assert again.cfg.pre_tanh_limit == 0.5
+    del settings["pre_tanh_limit"]
+    assert network_of(settings, learner.model.state_dict()).cfg.pre_tanh_limit is None
 
 
 def test_actions_are_squashed() -> None:

@@ -49,6 +49,7 @@ ADDED_LATER: dict[str, Any] = {
     "algo.average_rate": 0.0,
     "algo.learner": "ppo",
     "algo.noise_correlation": 0.0,
+    "algo.pre_tanh_limit": None,
     "keep_replay": False,
     "shaping.name": "none",
     "shaping.kernel_weight": 0.0,
@@ -61,7 +62,8 @@ ADDED_LATER: dict[str, Any] = {
     "time_limit_min": None,
 }
 
-_ONLY_SAC = ("algo.average_rate", "algo.noise_correlation")  # PPO has no such keys
+# PPO has no such keys.
+_ONLY_SAC = ("algo.average_rate", "algo.noise_correlation", "algo.pre_tanh_limit")
 
 # Keys that have an effect only if the wrist is planned.
 _ONLY_PLANNED = ("action.hold_steps", "action.carry_load")

@@ -59,6 +59,7 @@ _ABOVE_ZERO = (
     "algo.observation_clip",
     "algo.reward_scale",
     "algo.temperature_init",
+    "algo.pre_tanh_limit",
     "checkpoint.interval_s",
 )
 _SHARES = (

@@ -158,10 +158,17 @@ class SquashedCfg:
     """Log of the initial standard deviation, before tanh."""
     observation_clip: float
     """Standardised observations are clipped to plus or minus this many standard deviations."""
+    pre_tanh_limit: float | None = None
+    """Largest average magnitude of the entries of a mean before tanh, or None; older checkpoints
+    have none."""
 
 
 class SquashedPolicy(nn.Module):
     """A Gaussian with state-dependent mean and standard deviation, squashed by tanh to (-1, 1).
+
+    Where tanh is flat an action neither explores nor learns. With ``pre_tanh_limit`` L, a mean m
+    whose entries have an average magnitude above L is scaled down to L before tanh (output
+    normalisation, Wang et al. 2020).
 
     Args:
         cfg: sizes and initial values.
@@ -199,6 +206,8 @@ class SquashedPolicy(nn.Module):
     def forward(self, normalized: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and std before tanh, (M, A) each, at normalised observations (M, D)."""
         mean, log_std = precise_end(self.net, normalized).chunk(2, -1)
+        if (limit := self.cfg.pre_tanh_limit) is not None:
+            mean = mean / (mean.abs().mean(-1, keepdim=True) / limit).clamp(min=1.0)
         return mean, log_std.clamp(*_LOG_STD_RANGE).exp()
 
     def mean(self, obs: Tensor) -> Tensor:

@@ -60,6 +60,8 @@ class SACCfg(AlgoCfg):
     average_rate: float
     """Fraction by which the averaged policy moves towards the trained one after each of its
     updates, 0..1; 0: no average, the trained policy is evaluated and stored."""
+    pre_tanh_limit: float | None
+    """Largest average magnitude of the entries of the policy's mean before tanh; None: no limit."""
     warmup_steps: int
     """Control steps of all simulations before the first update."""
     bfloat16: bool
@@ -132,6 +134,7 @@ class SACLearner:
             hidden=list(cfg.hidden),
             log_std_init=cfg.log_std_init,
             observation_clip=cfg.observation_clip,
+            pre_tanh_limit=cfg.pre_tanh_limit,
         )
         bias = env.warm_start() if cfg.warm_start else None
         self._policy = self.model = SquashedPolicy(network, weights, bias).to(device)
