@@ -7,13 +7,13 @@
     python benchmark/learning.py --collect          collect only, also from running runs
 
 The runs of `+experiment=fast` itself are those that tcdm50.py has stored. The other settings,
-each the same for all tasks: `fast-earlier` has the released observation, linear corrections,
-uncorrelated noise, and neither an average nor a reward for the grasp; `fast-clipped` and
-`fast-feasible` are the same with another wrist path; `ppo_fast-planned` is `+experiment=fast`
-with another learner, `algo=ppo_fast`; `ppo_fast-residual` has the carried wrist path, the
-released observation and no shaping; and `ppo-absolute` is the paper's PPO with its actions. Each
-run is an ordinary `pgdm-run`: the same command resumes it. Two runs train at a time, one thread
-each.
+each the same for all tasks: `fast-limited` also limits the policy's mean before tanh;
+`fast-earlier` has the released observation, linear corrections, uncorrelated noise, and neither
+an average nor a reward for the grasp; `fast-clipped` and `fast-feasible` are the same with another
+wrist path; `ppo_fast-planned` is `+experiment=fast` with another learner, `algo=ppo_fast`;
+`ppo_fast-residual` has the carried wrist path, the released observation and no shaping; and
+`ppo-absolute` is the paper's PPO with its actions. Each run is an ordinary `pgdm-run`: the same
+command resumes it. Two runs train at a time, one thread each.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ EARLIER = (
 )
 SETTINGS = {
     "fast": ("+experiment=fast",),
+    "fast-limited": ("+experiment=fast", "algo.pre_tanh_limit=1"),
     "fast-earlier": EARLIER,
     "fast-clipped": (*EARLIER, "action.wrist_path=clipped"),
     "fast-feasible": (*EARLIER, "action.wrist_path=feasible"),

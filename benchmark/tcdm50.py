@@ -73,6 +73,12 @@ def nothing(task: str) -> float:
     return float(paper()["null_policy"][task])
 
 
+def papers(task: str) -> float:
+    """Return the paper's success."""
+    value = compose([f"task={task}"]).task.paper_success
+    return nan if value is None else value
+
+
 def table(rows: dict[Path, dict[str, Any]]) -> str:
     """Return stored results as a Markdown table, worst first."""
     lines = [
@@ -120,7 +126,7 @@ def task_table(tasks: dict[str, list[dict[str, Any]]]) -> str:
     for task, rows in tasks.items():
         cfg = compose([f"task={task}"]).task
         bound = rows[0].get(WRIST_BOUND, nan)
-        cells = (mean_of(rows, SUCCESS), bound, nothing(task), cfg.paper_success)
+        cells = (mean_of(rows, SUCCESS), float(bound), nothing(task), papers(task))
         for group in ("all", cfg.pregrasp_source):
             groups.setdefault(group, []).append(cells)
         seeds = ", ".join(f"{row['metrics'][SUCCESS]:.1%}" for row in rows)
@@ -148,8 +154,14 @@ def draw(tasks: dict[str, list[dict[str, Any]]], file: Path) -> None:
     for row, results in zip(at, tasks.values(), strict=True):
         seeds = [result["metrics"][SUCCESS] for result in results]
         axes.plot(seeds, [row] * len(seeds), "|", color="#1d5c55", label="each seed")
-    paper_s = [compose([f"task={task}"]).task.paper_success for task in tasks]
-    axes.plot(paper_s, at, "D", color="#c2571a", markersize=4, label="paper, 50,000,000 frames")
+    axes.plot(
+        [papers(task) for task in tasks],
+        at,
+        "D",
+        color="#c2571a",
+        markersize=4,
+        label="paper, 50,000,000 frames",
+    )
     axes.plot(
         [nothing(t) for t in tasks], at, "x", color="grey", markersize=4, label="doing nothing"
     )
