@@ -194,9 +194,10 @@ def main() -> None:
     rows = stored()
     tasks = by_task(rows)
     title = f"{len(tasks)} of {len(TASKS)} tasks, {sum(map(len, tasks.values()))} runs"
-    if rows:
+    if tasks:  # none while all stored runs have earlier settings
         average = mean(mean_of(of_task, SUCCESS) for of_task in tasks.values())
         title += f", sampled success {average:.1%}, the mean over the tasks"
+    if rows:
         (RESULTS / "README.md").write_text(
             f"# {title}\n\n`+experiment=fast`; not comparable with the paper (50,000,000 frames, "
             "3 seeds). The title counts runs with today's settings; those marked earlier were made "

@@ -520,7 +520,7 @@ def squashed(bias: Tensor | None = None, log_std: float = -1.0) -> SquashedPolic
     return SquashedPolicy(cfg, torch_stream(0, "weights"), bias)
 
 
-def test_a_mean_beyond_the_limit_is_scaled_down_and_still_learns() -> None:
+def test_a_mean_beyond_the_limit_is_scaled_down_and_no_other() -> None:
     policy = squashed()  # A = 2
     limited = SquashedPolicy(replace(policy.cfg, pre_tanh_limit=1.0), torch_stream(0, "weights"))
     obs = torch.zeros(1, D)
