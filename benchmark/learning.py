@@ -7,7 +7,8 @@
     python benchmark/learning.py --collect          collect only, also from running runs
 
 The runs of `+experiment=fast` itself are those that tcdm50.py has stored. The other settings,
-each the same for all tasks: `fast-limited` also limits the policy's mean before tanh;
+each the same for all tasks: `fast-limit-1` limits the policy's mean before tanh more,
+and `fast-unlimited` not at all;
 `fast-earlier` has the released observation, linear corrections, uncorrelated noise, and neither
 an average nor a reward for the grasp; `fast-clipped` and `fast-feasible` are the same with another
 wrist path; `ppo_fast-planned` is `+experiment=fast` with another learner, `algo=ppo_fast`;
@@ -49,10 +50,12 @@ EARLIER = (
     "action.residual_power=1",
     "algo.noise_correlation=0",
     "algo.average_rate=0",
+    "algo.pre_tanh_limit=null",
 )
 SETTINGS = {
     "fast": ("+experiment=fast",),
-    "fast-limited": ("+experiment=fast", "algo.pre_tanh_limit=1"),
+    "fast-limit-1": ("+experiment=fast", "algo.pre_tanh_limit=1"),
+    "fast-unlimited": ("+experiment=fast", "algo.pre_tanh_limit=null"),
     "fast-earlier": EARLIER,
     "fast-clipped": (*EARLIER, "action.wrist_path=clipped"),
     "fast-feasible": (*EARLIER, "action.wrist_path=feasible"),
