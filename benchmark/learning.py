@@ -73,7 +73,7 @@ SETTINGS = {
     "ppo_fast-residual": ("algo=ppo_fast", "action=residual", "eval.interval_frames=100000"),
     "ppo-absolute": ("algo=ppo", "action=absolute", "eval.interval_frames=100000"),
 }
-SEEDS = {setting: (0, 1, 2) if setting == "fast" else (0,) for setting in SETTINGS}
+SEEDS = {s: (0, 1, 2) if s in ("fast", "fast-unlimited") else (0,) for s in SETTINGS}
 TRAINED = [setting for setting in SETTINGS if setting != "fast"]
 COMMON = ("eval.video_every_eval=false", "keep_replay=true")
 CURVES = ("success", "lifted", "return", "com_error")
