@@ -192,6 +192,10 @@ def test_an_elbow_is_two_parts_equal_each_time(
     steps.clear()
     cached = convex_parts(mesh, PartsCfg(), lambda step, done, total: steps.append(step))
     assert not steps and np.array_equal(cached[0].vertices, found[0][0].vertices)
+    (file,) = (tmp_path / "two" / "parts").glob("*.npz")
+    file.write_bytes(file.read_bytes()[:-100])
+    again = convex_parts(mesh, PartsCfg(), lambda step, done, total: steps.append(step))
+    assert steps and np.array_equal(again[0].vertices, found[0][0].vertices)
 
 
 def test_a_damaged_record_is_named() -> None:

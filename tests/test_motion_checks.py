@@ -116,6 +116,15 @@ def test_the_lowest_point_counts(kind: str, size: str, half: float) -> None:
     table.check(table.lifted(motion), "it")
 
 
+@pytest.mark.parametrize("factor", [1.5, 3.0])
+def test_every_length_can_be_resampled(factor: float) -> None:
+    for count in range(10, 150):
+        poses = line(0.2, count)
+        slow = slower(Poses(poses[:, :3], poses[:, 3:]), factor)
+        assert len(slow.pos) == int((count - 1) * factor + 1e-9) + 1
+        assert slow.pos[0] == pytest.approx(poses[0, :3]) and np.isfinite(slow.quat).all()
+
+
 def test_poses_come_from_csv_json_and_npz() -> None:
     rows = line(0.2)
     times = 0.02 * np.arange(30)

@@ -5,13 +5,14 @@ import shutil
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fake_runs import empty_database
 from pgdm.config.compose import compose_plain
 from pgdm.errors import RunError, TrackingError
 from pgdm.report.results import Results
-from pgdm.report.runs import RETURN, SUCCESS, Run
+from pgdm.report.runs import RETURN, SHAPING, SUCCESS, Run
 from pgdm.report.source import Found, find
 from pgdm.tracking.group import Group
 from pgdm.tracking.mlflow import store_uri
@@ -105,7 +106,10 @@ def test_mlflow(tmp_path: Path, empty_database: Path) -> None:
     root = tmp_path / "runs"
     root.mkdir()
     shutil.copy(empty_database, root / "mlflow.db")
-    make(root / "a", 0.8, "task=cup-pour1", "algo=ppo_fast")
+    ended = {"ended_by": "time_limit"}
+    first = make(root / "a", 0.8, "task=cup-pour1", "algo=ppo_fast", result=ended)
+    log = first.path / "metrics.jsonl"
+    log.write_text(log.read_text().replace('"train/kl": 0.1', f'"{SHAPING}": 3.0'))
     make(root / "b", 0.6, "task=cup-pour1", "algo=ppo_fast", "seed=1", state="failed")
     (root / "sweep").mkdir()
     direct = read(root)
@@ -130,4 +134,6 @@ def test_mlflow(tmp_path: Path, empty_database: Path) -> None:
         assert run.metric(SUCCESS) == same.metric(SUCCESS)
         assert run.evaluations[SUCCESS].tolist() == same.evaluations[SUCCESS].tolist()
         assert run.facts == same.facts
+        assert np.array_equal(run.training[SHAPING], same.training[SHAPING], equal_nan=True)
+        assert np.isfinite(run.training[SHAPING]).all() == (run.seed == 0)
         assert run.video is not None and run.video.with_suffix(".png").exists()

@@ -17,6 +17,7 @@ from fake_runs import empty_database, end, make, train
 from pgdm.config.saved import save_config
 from pgdm.runs.files import LINK, read_json, write_json
 from pgdm.runs.folder import PARENT, RunFolder
+from pgdm.sweep.driver import status_of
 from pgdm.sweep.ledger import Ending, Ledger
 from pgdm.sweep.mirror import SweepMirror
 from pgdm.sweep.plan import Plan, write_plan
@@ -79,6 +80,20 @@ def test_a_sweep_is_one_run_however_often_it_is_opened(whole: Plan, tmp_path: Pa
     (whole.folder / LINK).unlink()
     SweepMirror.of(whole, unexpected).open(whole)
     assert len(runs(whole.folder)) == 1
+
+
+@pytest.mark.parametrize(
+    ("states", "stopped", "status"),
+    [
+        (["finished", "finished"], False, "finished"),
+        (["finished", "failed"], False, "failed"),  # also if only the first one was retried
+        (["finished", "cancelled"], False, "failed"),
+        (["finished", "waiting"], False, "interrupted"),
+        (["finished", "running"], True, "interrupted"),
+    ],
+)
+def test_status_of_a_sweep(states: list[str], stopped: bool, status: str) -> None:
+    assert status_of(states, stopped) == status
 
 
 def test_jobs_are_shown_below_it(whole: Plan, tmp_path: Path) -> None:

@@ -43,6 +43,7 @@ def test_what_squeue_says() -> None:
     codes = {slurm_id: found[slurm_id].exit_code for slurm_id in ("31_0", "31_1", "29", "28")}
     assert codes == {"31_0": 143, "31_1": -15, "29": 0, "28": 125}
     assert parse("") == {}
+    assert parse("\n31_5 PENDING 0\n") == {"31_5": Standing("PENDING", 0, "")}
 
 
 def squeue(folder: Path, text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import lzma
 import re
 import shutil
 import sys
@@ -20,6 +21,7 @@ import yaml
 from command_line import TINY_SAC, command, unchanged
 from pgdm.errors import PgdmError, ZooError
 from pgdm.export import tensors
+from pgdm.export.tensors import MOST_BYTES
 from pgdm.export.trained import of_run
 from pgdm.zoo import Zoo
 from pgdm.zoo.policy import open_entry
@@ -104,6 +106,24 @@ def test_list_show_and_get(zoo: Path, tmp_path: Path) -> None:
     assert outcome.code == 0, outcome.err
     back = tensors.read(tmp_path / f"{TASK}.safetensors")
     assert back.sha256() == shown["policy_sha256"]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (lzma.compress(bytes(MOST_BYTES + 1), preset=0), "would unpack to more than"),
+        (lzma.compress(b"x")[:-4], "cut off|damaged"),
+    ],
+    ids=["too large", "cut off"],
+)
+def test_get_unpacks_only_what_a_policy_may_be(content: bytes, message: str, zoo: Path) -> None:
+    (zoo / FILE).write_bytes(content)
+    index = json.loads((zoo / "index.json").read_text())
+    digest = hashlib.sha256(content).hexdigest()
+    index["entries"][TASK] |= {"sha256": digest, "bytes": len(content)}
+    (zoo / "index.json").write_text(json.dumps(index))
+    outcome = command("pgdm", "zoo", "get", TASK)
+    assert outcome.code == 1 and re.search(message, outcome.err), outcome.err
 
 
 @pytest.mark.slow

@@ -161,6 +161,10 @@ def read_yaml(path: str | os.PathLike[str]) -> Any:
     return parse_yaml(read_text(path))
 
 
+# PyYAML raises the last two for a value that does not fit its tag, such as `!!bool maybe`.
+_YAML_ERRORS = (yaml.YAMLError, RecursionError, OverflowError, LookupError, AttributeError)
+
+
 def parse_yaml(text: str) -> Any:
     """Return the plain values of a YAML text; None if it is empty.
 
@@ -170,7 +174,7 @@ def parse_yaml(text: str) -> Any:
     """
     try:
         return _Loader(text).get_single_data()
-    except (yaml.YAMLError, RecursionError, OverflowError) as error:
+    except _YAML_ERRORS as error:
         text = " ".join(str(error).replace('in "<unicode string>", ', "in ").split())
         raise ValueError(f"not valid YAML: {text}") from error
 

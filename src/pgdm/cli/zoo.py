@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import lzma
 from pathlib import Path
 from typing import Annotated
 
@@ -87,14 +86,16 @@ def get(
     from pgdm import files, paths
     from pgdm.zoo import Zoo
 
+    with loading():
+        from pgdm.export.tensors import unpacked
     path = out or Path(f"{name}.safetensors")
     if path.suffix != ".safetensors":
         raise ConfigError(f"--out '{path}': give a name that ends in .safetensors")
-    content = Zoo(place).content(name)
+    content = unpacked(Zoo(place).content(name), name)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with paths.replacing(path) as temp:
-            temp.write_bytes(lzma.decompress(content))
+            temp.write_bytes(content)
     except OSError as error:
         raise ConfigError(f"cannot write '{path}': {files.reason(error)}") from error
     print(f"policy: {path} ({path.stat().st_size / 1e6:.2f} MB)")

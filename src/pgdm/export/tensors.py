@@ -91,7 +91,7 @@ def parse(raw: bytes, where: str, video: Path) -> TrainedPolicy:
         where: source of the content, for messages.
         video: path for a video of the policy.
     """
-    raw = _unpacked(raw, where)
+    raw = unpacked(raw, where)
     about = _about(raw, where)
     try:
         tensors = load(raw)
@@ -125,11 +125,15 @@ def parse(raw: bytes, where: str, video: Path) -> TrainedPolicy:
 
 def about(raw: bytes, where: str) -> dict[str, Any]:
     """Return the description in the content of a file; arguments and errors as for `parse`."""
-    return _about(_unpacked(raw, where), where)
+    return _about(unpacked(raw, where), where)
 
 
-def _unpacked(raw: bytes, where: str) -> bytes:
-    """Return the content of an ``.xz``; other content as it is."""
+def unpacked(raw: bytes, where: str) -> bytes:
+    """Return the content of an ``.xz``; other content as it is.
+
+    Raises:
+        CheckpointError: if it is damaged or cut off, or would exceed `MOST_BYTES`.
+    """
     if not raw.startswith(b"\xfd7zXZ\x00"):
         return raw
     try:

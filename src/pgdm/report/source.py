@@ -13,7 +13,7 @@ import yaml
 from pgdm import files, paths
 from pgdm.errors import RunError, TrackingError
 from pgdm.library.progress import StepProgress, counted
-from pgdm.report.runs import METRICS, RETURN, Run, planned_run, read_run
+from pgdm.report.runs import METRICS, RETURN, SHAPING, Run, planned_run, read_run
 from pgdm.runs.files import (
     CONFIG,
     CONFIG_KINDS,
@@ -158,8 +158,8 @@ def _copied(client: MlflowClient, run: MlflowRun, place: Path) -> Path:
     config = _nested({**run.data.params, **now})
     (folder / CONFIG).write_text(yaml.safe_dump(config))
     lines: dict[tuple[str, int], dict[str, Any]] = {}
-    for name in (*METRICS, RETURN):
-        kind = "train" if name == RETURN else "eval"
+    for name in (*METRICS, RETURN, SHAPING):
+        kind = "train" if name in (RETURN, SHAPING) else "eval"
         for entry in client.get_metric_history(run_id, name):
             header = {"frames": entry.step, "iteration": 0, "time_s": 0.0, "kind": kind}
             lines.setdefault((kind, entry.step), header)[name] = entry.value

@@ -55,7 +55,7 @@ TAGS = {
     "seed": "seed",
     "budget": "budget",
 }
-FACTS = ("asset_source", "pregrasp_used", "expert_hand", "motion_sha256", "git")
+FACTS = ("asset_source", "pregrasp_used", "expert_hand", "motion_sha256", "git", "ended_by")
 """Tags that are not settings: the run itself writes them to ``result.json`` and ``mlflow.json``."""
 
 

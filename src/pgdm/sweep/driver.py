@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -50,6 +50,18 @@ class _Worker:
     """Whether the worker was asked to stop."""
 
 
+def status_of(states: Collection[str], stopped: bool) -> str:
+    """Return the status of a sweep from the states of all its jobs, also of those not retried.
+
+    Args:
+        states: of all jobs of the sweep.
+        stopped: whether the driver was stopped before its jobs were finished.
+    """
+    if all(state == FINISHED for state in states):
+        return FINISHED
+    return INTERRUPTED if stopped or WAITING in states else FAILED
+
+
 class Driver:
     """Drives a plan; the caller must hold the sweep's lock.
 
@@ -90,7 +102,7 @@ class Driver:
         states = self._ledger.states()
         whole = all(states[key] == FINISHED for key in self._jobs)
         stopped = stop() and not whole
-        self._mirror.close(FINISHED if whole else INTERRUPTED if stopped else FAILED)
+        self._mirror.close(status_of(states.values(), stopped))
         self._notify(self._view.line())
         if text := self._view.failures():
             self._notify(text)

@@ -106,9 +106,9 @@ class Queue:
 def parse(text: str) -> dict[str, Standing]:
     """Parse the output of ``squeue`` into a mapping from Slurm job ID to state."""
     found = {}
-    for line in text.splitlines():
-        slurm_id, state, status, reason = line.split(None, 3)
-        found[slurm_id] = Standing(state, int(status), reason.strip())
+    for line in filter(str.strip, text.splitlines()):
+        slurm_id, state, status, *reason = line.split(None, 3)
+        found[slurm_id] = Standing(state, int(status), "".join(reason).strip())
     return found
 
 

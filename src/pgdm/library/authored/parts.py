@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import threading
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import numpy as np
 import trimesh
 
 from pgdm import paths
-from pgdm.errors import ConfigError, LibraryError
+from pgdm.errors import ConfigError, CorruptAssetError, LibraryError
 from pgdm.library.authored.mesh import SoundMesh
 from pgdm.library.files import npz
 from pgdm.library.progress import StepProgress, silent
@@ -77,7 +78,7 @@ def convex_parts(mesh: SoundMesh, cfg: PartsCfg, progress: StepProgress = silent
     """
     cfg.check()
     cache = paths.home() / "parts" / f"{_key(mesh, cfg)}.npz"
-    if cache.is_file():
+    with contextlib.suppress(CorruptAssetError, KeyError):  # missing or damaged
         return _read(npz.read_npz(cache))
     if mesh.volume_m3 / mesh.hull_m3 > 1.0 - 1e-6 and mesh.closed and mesh.num_bodies == 1:
         hull = mesh.trimesh().convex_hull  # already convex

@@ -175,6 +175,8 @@ def write(model: ET.Element, path: Path, note: str) -> list[tuple[Path, Path]]:
             item.set("name", origin.stem)
         if copied.get(target, origin) != origin:
             target = target.with_name(f"{origin.parent.name}_{origin.name}")
+        while copied.get(target, origin) != origin:
+            target = target.with_name(f"_{target.name}")
         if target not in copied:
             if not origin.is_file():
                 raise CorruptAssetError(f"{path.name}: its file '{origin.name}' is missing")

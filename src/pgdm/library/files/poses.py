@@ -109,7 +109,8 @@ def resampled(rows: np.ndarray, times: np.ndarray | None, label: str) -> PoseFil
     elapsed: np.ndarray = np.asarray(times - times[0])
     if np.allclose(np.diff(elapsed), STEP_S, atol=1e-6):
         return PoseFile(pos, quat, repairs)
-    wanted = STEP_S * np.arange(int(elapsed[-1] / STEP_S + 1e-9) + 1)
+    # The last of these products may exceed the last time by a rounding error.
+    wanted = np.minimum(STEP_S * np.arange(int(elapsed[-1] / STEP_S + 1e-9) + 1), elapsed[-1])
     repairs.append(
         f"resampled {len(rows)} rows over {elapsed[-1]:.2f} s to {len(wanted)} rows "
         f"{STEP_S:g} s apart"
