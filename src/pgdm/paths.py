@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -131,6 +132,12 @@ def unused(folder: Path, stem: str, suffix: str = "") -> Path:
 def leaves(path: Path, folder: Path) -> bool:
     """Return whether a path is outside of a folder once links are followed."""
     return not path.resolve().is_relative_to(folder.resolve())
+
+
+def free_bytes(folder: Path) -> int:
+    """Return the free space on the disk of a folder, or of its nearest parent that exists."""
+    place = folder.absolute()
+    return shutil.disk_usage(next(p for p in (place, *place.parents) if p.is_dir())).free
 
 
 @contextlib.contextmanager

@@ -84,7 +84,7 @@ def _machine() -> Iterator[Check]:
     cure = f"only {free:.1f} GB are free, a run needs about {ENOUGH_GB}: close other programs"
     enough = free >= ENOUGH_GB
     yield Check("memory", enough, f"{free:.1f} GB are free" if enough else cure)
-    disk = shutil.disk_usage(_existing(paths.library())).free / 1e9
+    disk = paths.free_bytes(paths.library()) / 1e9
     yield Check("disk", disk > 1, f"{disk:.1f} GB are free in {paths.library()} (needed: over 1)")
     if torch.cuda.is_available():
         yield Check("GPU", True, f"{torch.cuda.get_device_name()}: used with device=cuda")
@@ -136,14 +136,6 @@ def _slurm() -> Iterator[Check]:
         yield Check(
             "Slurm", True, f"{'; '.join(filter(None, nodes))}: used with hydra/launcher=slurm"
         )
-
-
-def _existing(folder: os.PathLike[str]) -> str:
-    """Return a folder, or its nearest parent that exists."""
-    path = os.path.abspath(folder)
-    while not os.path.isdir(path):
-        path = os.path.dirname(path)
-    return path
 
 
 CHECKS: dict[str, Callable[[], Iterator[Check]]] = {

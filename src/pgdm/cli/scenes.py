@@ -40,18 +40,14 @@ def open_scene(cfg: ExperimentCfg, progress: StepProgress | None = None) -> Open
     return Opened(cfg, library, library.motion(cfg.task.motion), scene)
 
 
-def open_env(cfg: ExperimentCfg, origins: object = None) -> EnvBuilder:
+def open_env(cfg: ExperimentCfg) -> EnvBuilder:
     """Compile the environment of an experiment, and print what deviates from its settings.
-
-    Args:
-        cfg: the experiment.
-        origins: asset sources that a run recorded; see `Library.serving`.
 
     Raises:
         PgdmError: if an asset, the start or the wrist plan is missing and cannot be made.
     """
     with bars() as progress:
-        library = assets(cfg, notify, progress).serving(origins)
+        library = assets(cfg, notify, progress)
         progress("compiling the scene", 0, 1)
         builder = env_builder(cfg, library, notify, progress)
     for note in builder.notes:

@@ -16,6 +16,7 @@ from pgdm.deploy.names import REACHED, check_base
 from pgdm.deploy.playback import Playback
 from pgdm.deploy.rollout import Rollout
 from pgdm.errors import ConfigError, check_above_zero, check_at_least
+from pgdm.library.files.keyframes import continuous
 from pgdm.sim.scene import Scene
 
 REACH_M, REACH_RAD = 1e-3, 1e-2
@@ -135,9 +136,7 @@ def mount_pose(scene: Scene, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray
     mount = Rotation.from_quat(scene.index.mount_quat, scalar_first=True)
     pos = scene.index.mount_pos + mount.apply(joints[:, :3])
     turn = (mount * Rotation.from_euler("XYZ", joints[:, 3:6])).as_quat(scalar_first=True)
-    signs = np.sign((turn[1:] * turn[:-1]).sum(1))
-    turn[1:] *= np.cumprod(np.where(signs == 0, 1.0, signs))[:, None]
-    return pos, turn
+    return pos, continuous(turn)
 
 
 def _curve(rollout: Rollout, values: np.ndarray, start: np.ndarray, cfg: ConvertCfg) -> np.ndarray:
@@ -161,8 +160,6 @@ def _object(rollout: Rollout, time_s: np.ndarray, cfg: ConvertCfg) -> tuple[np.n
     known = np.arange(len(rollout.object_pos)) * rollout.dt_s
     at = time_s * cfg.speed - _LEAD * cfg.smooth_s
     pos = np.stack([np.interp(at, known, column) for column in rollout.object_pos.T], 1)
-    signs = np.sign((rollout.object_quat[1:] * rollout.object_quat[:-1]).sum(1))
-    flips = np.append(1.0, np.cumprod(np.where(signs == 0, 1.0, signs)))
-    quats = rollout.object_quat * flips[:, None]
-    quat = np.stack([np.interp(at, known, column) for column in quats.T], 1)
+    quats = continuous(rollout.object_quat).T
+    quat = np.stack([np.interp(at, known, column) for column in quats], 1)
     return pos, quat / np.linalg.norm(quat, axis=1, keepdims=True)

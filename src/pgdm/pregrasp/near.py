@@ -76,7 +76,6 @@ def poses_near(
     qpos: np.ndarray,
     fingers: np.ndarray,
     beyond: Beyond,
-    seed: int = 0,
     progress: StepProgress = silent,
 ) -> list[NearPose]:
     """Search for poses of the hand near the object; equal arguments give equal poses.
@@ -86,7 +85,6 @@ def poses_near(
         qpos: whole scene (nq,); objects stay where they are.
         fingers: posture (J,) rad that the finger joints should stay near.
         beyond: further cost of a pose.
-        seed: seed of the search.
         progress: called before each start of the search, and at the end.
 
     Returns:
@@ -96,7 +94,7 @@ def poses_near(
         SceneError: no such pose was found.
     """
     search = _Search(scene, np.asarray(qpos, float), fingers, beyond)
-    stream = seeding.numpy_stream(seed, "near")
+    stream = seeding.numpy_stream(0, "near")
     found = []
     for start in range(STARTS):
         progress("pre-grasp search", start, STARTS)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ import torch
 
 from pgdm import files
 from pgdm.errors import CheckpointError, amount
-from pgdm.paths import TEMPORARY, replacing
+from pgdm.paths import TEMPORARY, free_bytes, replacing
 
 _MAGIC = b"pgdm-checkpoint-1"
 _FOOTER_SIZE = len(_MAGIC) + hashlib.sha256().digest_size
@@ -142,8 +141,8 @@ def write_checkpoint(path: Path, state: State) -> None:
     except OSError as error:
         raise CheckpointError(
             f"cannot write a checkpoint of {len(payload) / 1e6:.1f} MB to {path.parent} "
-            f"({_free_space(path.parent)}): {error.strerror or error}; make room or give write "
-            "access, earlier checkpoints are untouched"
+            f"({free_bytes(path.parent) / 1e6:.1f} MB free): {error.strerror or error}; make room or "
+            "give write access, earlier checkpoints are untouched"
         ) from error
 
 
@@ -190,8 +189,3 @@ def _set_aside(path: Path) -> None:
         path.rename(path.with_suffix(".damaged"))
     except OSError as error:
         _log.warning("cannot rename %s: %s", path, error.strerror)
-
-
-def _free_space(folder: Path) -> str:
-    existing = next((p for p in (folder, *folder.parents) if p.is_dir()), Path("/"))
-    return f"{shutil.disk_usage(existing).free / 1e6:.1f} MB free"

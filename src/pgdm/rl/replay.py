@@ -20,7 +20,7 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from pgdm.errors import CheckpointError, RunError
-from pgdm.paths import replacing
+from pgdm.paths import free_bytes, replacing
 
 _SUFFIX, _ABOUT = ".bin", "columns.json"
 _COPIED_FRAMES = 65_536
@@ -229,10 +229,9 @@ def _reserve(folder: Path, columns: Mapping[str, Column], capacity: int) -> list
         for path in sizes:
             with contextlib.suppress(OSError):
                 os.truncate(path, before[path]) if path in before else path.unlink()
-        existing = next(p for p in (folder, *folder.parents) if p.is_dir())
         raise RunError(
             f"cannot reserve {sum(sizes.values()) / 1e9:.1f} GB for the replay in {folder} "
-            f"({shutil.disk_usage(existing).free / 1e9:.1f} GB free): {error.strerror or error}; "
+            f"({free_bytes(folder) / 1e9:.1f} GB free): {error.strerror or error}; "
             "make room, or choose fewer total_frames or another run_dir"
         ) from error
     return [path for path in sizes if path not in before]

@@ -14,7 +14,7 @@ from pgdm.runs.files import RESULT, read_json
 from pgdm.runs.folder import RunFolder, find_runs
 from pgdm.sweep.ledger import FINISHED
 from pgdm.sweep.plan import Job, Plan
-from pgdm.sweep.status import run_ending
+from pgdm.sweep.repair import job_ending
 
 _NEWEST = 50
 """How many of the newest earlier runs to look at."""
@@ -68,7 +68,7 @@ def _frames_done(job: Job) -> int:
     """Return the frames that a job has completed: ``total_frames`` only if it is finished."""
     total = job.cfg.total_frames
     try:
-        found = run_ending(Path(job.cfg.run_dir), total, job.cfg.time_limit_min)
+        found = job_ending(job)
     except RunError:  # the job's worker reports the error
         return 0
     return total if found.state == FINISHED else min(found.frames or 0, total - 1)

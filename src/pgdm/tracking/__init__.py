@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pgdm.errors import UnknownNameError
+from pgdm.errors import check_name
 from pgdm.runs.folder import RunFolder
 from pgdm.runs.tracker import NullTracker, Tracker
 from pgdm.tracking.address import chosen
@@ -68,7 +68,5 @@ def open_tracker(cfg: TrackingCfg, folder: RunFolder, facts: Facts) -> Tracker:
     Raises:
         UnknownNameError: if there is no such kind.
     """
-    builder = TRACKERS.get(cfg.kind)
-    if builder is None:
-        raise UnknownNameError("tracking.kind", cfg.kind, TRACKERS)
-    return builder(cfg, folder, facts)
+    check_name("tracking.kind", cfg.kind, TRACKERS)
+    return TRACKERS[cfg.kind](cfg, folder, facts)

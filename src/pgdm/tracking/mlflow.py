@@ -37,7 +37,6 @@ STATUS = {
     "running": "RUNNING",
     "finished": "FINISHED",
     "interrupted": "KILLED",
-    "killed": "KILLED",
     "failed": "FAILED",
 }
 _BATCH, _PARAMS = 1000, 100  # the server's limits: metrics and parameters per call

@@ -10,6 +10,7 @@ import numpy as np
 
 from pgdm.errors import ConfigError, check_name
 from pgdm.library.couplings import Couplings
+from pgdm.pregrasp.hand_geometry import unit
 
 HUMAN = ("index", "middle", "ring", "little", "thumb")
 """Human fingers, in the order in which ``pgdm author hand`` lists them."""
@@ -123,9 +124,9 @@ def find(model: mujoco.MjModel, chosen: Mapping[str, str], label: str) -> Anatom
     fingers = [Finger(human[i], chains[i], tips[i]) for i in order]
     others = [f for f in fingers if f.human != "thumb"]
     knuckles = np.array([_middle(model, data, f.joints, 0) for f in others])
-    along = _unit(np.array([ends[f.link] for f in others]).mean(0) - knuckles.mean(0))
+    along = unit(np.array([ends[f.link] for f in others]).mean(0) - knuckles.mean(0))
     across = knuckles[-1] - knuckles[0]
-    across = _unit(across - along * (along @ across))
+    across = unit(across - along * (along @ across))
     wrist = _wrist(model, data, palm, wrist_joints, knuckles.mean(0), along)
     points = {"wrist_point": (model.body(palm).name, _local(data, palm, wrist))}
     for finger in fingers:
@@ -239,7 +240,7 @@ def _end(model: mujoco.MjModel, data: mujoco.MjData, tip: int, label: str) -> np
         )
     last = int(model.body_jntadr[tip] + model.body_jntnum[tip] - 1)
     start = _middle(model, data, [last], 0)
-    along = _unit(0.5 * (corners.min(0) + corners.max(0)) - start)
+    along = unit(0.5 * (corners.min(0) + corners.max(0)) - start)
     length = float(((corners - start) @ along).max())
     return start + max(0.5 * length, length - _PAD_M) * along
 
@@ -260,7 +261,7 @@ def _middle(
         if not len(corners):
             continue
         middle = 0.5 * (corners.min(0) + corners.max(0))
-        if abs(_unit(middle - anchor) @ axis) < _ALONG:
+        if abs(unit(middle - anchor) @ axis) < _ALONG:
             anchor = anchor + axis * (axis @ (middle - anchor))
         break
     return anchor.copy()
@@ -326,7 +327,3 @@ def _name(model: mujoco.MjModel, body: int) -> str:
 def _listed(names: object) -> str:
     listed = [f"'{name}'" for name in names]  # type: ignore[attr-defined]
     return ", ".join(listed[:8]) + (f" and {len(listed) - 8} more" if len(listed) > 8 else "")
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / max(float(np.linalg.norm(vector)), 1e-9)

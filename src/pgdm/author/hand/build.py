@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -69,10 +69,6 @@ class Plan:
     """Reset positions, rad or m, of the joints that are not reset to zero."""
     excluded: list[tuple[str, str]]
     """Pairs of bodies that do not collide: they overlap in the reset pose."""
-
-    def at(self, rotation: np.ndarray, place: np.ndarray) -> Plan:
-        """Return the plan with another pose of the mount."""
-        return replace(self, rotation=rotation, place=place)
 
 
 def named(xml: str) -> mujoco.MjSpec:

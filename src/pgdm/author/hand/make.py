@@ -130,7 +130,7 @@ def author_hand(request: HandRequest, progress: StepProgress = silent) -> Author
     cfg = _settings(request.name, found)
     normal = _palm_normal(light, found, plan, cfg)
     rotation, side = _mounted(found, normal, request.turn_deg)
-    plan = plan.at(rotation, np.array(request.place))
+    plan = replace(plan, rotation=rotation, place=np.array(request.place))
     plan = replace(plan, excluded=overlapping(_scene(light, found, plan, cfg)))
     if said := _other_side(label, source.xml, side):
         notes.append(said)
