@@ -13,12 +13,12 @@ from pgdm.config.compose import compose
 from pgdm.errors import ConfigError
 from pgdm.experiment import env_builder
 from pgdm.library import open_library
-from pgdm.mdp.shaping import GRASP, SLOPE, ShapingCfg
+from pgdm.mdp.shaping import GRASP, SLOPE, ShapingCfg, shaped
 from pgdm.runs.files import read_json
 
 SETTINGS = ("task=hammer-use1", "shaping=soft_end", "shaping.soft_end_m=0.1")
 KERNEL = ("shaping.kernel_weight=5", "shaping.kernel_scale=10")
-NO_SHAPING = ShapingCfg("none", 0.0, 10.0, 0.0, 20.0, None)
+NO_SHAPING = ShapingCfg("none", 0.0, 10.0, 0.0, 20.0, None, False)
 
 
 @pytest.mark.usefixtures("library_home")
@@ -65,6 +65,27 @@ def test_a_hand_that_moves_with_the_object_earns_the_whole_grasp_term() -> None:
     assert values == sorted(values, reverse=True) and values[-1] < 0.5
 
 
+@pytest.mark.usefixtures("library_home")
+def test_the_soft_end_counts_only_what_exceeds_the_plan() -> None:
+    env = env_builder(compose(["task=hammer-use1"]), open_library()).make(2, 1)
+    context = env._context(env.sim.read())
+    error = context.object_error  # at reset, the same in both simulations
+    context = replace(context, t=torch.tensor([1, 3]))
+    plan_error = torch.tensor([0.25, 0.0, 2.0]) * error[0]
+    cfg = replace(NO_SHAPING, soft_end_m=0.1)
+
+    def discount(beyond_plan: bool, plan: torch.Tensor | None) -> torch.Tensor:
+        changed = shaped(env.mdp.recipe, replace(cfg, beyond_plan=beyond_plan), plan).discount
+        assert changed is not None
+        return changed(context)
+
+    whole = torch.exp(-((error / 0.1) ** 2))
+    beyond = torch.exp(-((torch.tensor([0.75, 0.0]) * error / 0.1) ** 2))
+    torch.testing.assert_close(discount(True, plan_error), beyond)
+    torch.testing.assert_close(discount(True, None), whole)
+    torch.testing.assert_close(discount(False, plan_error), whole)
+
+
 @pytest.mark.parametrize(
     "far", [("pregrasp=none",), ("ablation=distance_15cm",), ("ablation=open_hand",)]
 )
@@ -81,6 +102,8 @@ def test_the_additions_are_described_in_words() -> None:
         "5 exp(-e/0.1 m) is added to the reward (e: the object's error), and "
         "future rewards are scaled by exp(-(e/0.15 m)^2) (e: the object's error)"
     )
+    beyond = replace(NO_SHAPING, soft_end_m=0.15, beyond_plan=True).described()
+    assert beyond.endswith("(e: the object's error, less that of the wrist plan)")
     assert "3 exp(-d/0.05 m), averaged over" in replace(NO_SHAPING, grasp_weight=3.0).described()
 
 

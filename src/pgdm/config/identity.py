@@ -57,6 +57,7 @@ ADDED_LATER: dict[str, Any] = {
     "shaping.grasp_weight": 0.0,
     "shaping.grasp_scale": 20.0,
     "shaping.soft_end_m": None,
+    "shaping.beyond_plan": False,
     "sim.engine": "mujoco",
     "sim.object_mass": "volume",
     "time_limit_min": None,

@@ -233,7 +233,8 @@ class EnvBuilder:
         check_count("num_threads", num_threads, 0)
         mdp, shaping = self.mdp, self._cfg.shaping
         if shaping is not None and stream == TRAIN:
-            mdp = replace(mdp, recipe=shaped(mdp.recipe, shaping))
+            error_m = None if self.wrist is None else torch.from_numpy(self.wrist.error_m)
+            mdp = replace(mdp, recipe=shaped(mdp.recipe, shaping, error_m))
         if stream == TRAIN and self._cfg.sim.engine == WARP:
             from pgdm.sim.warp import WarpBatch  # an optional dependency
 

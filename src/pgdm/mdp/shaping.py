@@ -8,7 +8,9 @@ factor gamma by
 
     reward + kernel_weight exp(-kernel_scale e) + grasp_weight mean_f exp(-grasp_scale d_f)
 
-and gamma exp(-(e / soft_end_m)^2), the same for all tasks.
+and gamma exp(-(e / soft_end_m)^2), the same for all tasks. With ``beyond_plan``, e in this discount
+is only what exceeds the wrist plan's error at that step, so that holding the object stays
+worthwhile where the base cannot follow the motion.
 """
 
 from __future__ import annotations
@@ -47,6 +49,9 @@ class ShapingCfg:
     """Decay rate of that term, 1/m."""
     soft_end_m: float | None
     """Scale of the extra discount, m; None: none."""
+    beyond_plan: bool
+    """Whether that discount counts only the error beyond that of the wrist plan, if there is a
+    plan."""
 
     def without_grasp(self) -> ShapingCfg:
         """Return the shaping without the grasp term, for starts that are not a pre-grasp."""
@@ -70,7 +75,8 @@ class ShapingCfg:
         if self.soft_end_m is not None:
             parts.append(
                 f"future rewards are scaled by exp(-(e/{self.soft_end_m:g} m)^2) "
-                "(e: the object's error)"
+                "(e: the object's error"
+                f"{', less that of the wrist plan' if self.beyond_plan else ''})"
             )
         return ", and ".join(parts)
 
@@ -88,8 +94,14 @@ class ShapingCfg:
             check_above_zero("shaping.soft_end_m", self.soft_end_m)
 
 
-def shaped(recipe: Recipe, cfg: ShapingCfg) -> Recipe:
-    """Return the recipe with the shaping's reward terms and discount."""
+def shaped(recipe: Recipe, cfg: ShapingCfg, plan_error_m: Tensor | None = None) -> Recipe:
+    """Return the recipe with the shaping's reward terms and discount.
+
+    Args:
+        recipe: of the method.
+        cfg: settings.
+        plan_error_m: error of the wrist plan after each step, (T-1,) m, if there is a plan.
+    """
 
     def slope(c: StepContext) -> Tensor:
         return torch.exp(-cfg.kernel_scale * c.object_error)
@@ -104,7 +116,10 @@ def shaped(recipe: Recipe, cfg: ShapingCfg) -> Recipe:
         reach = cfg.soft_end_m
 
         def discount(c: StepContext) -> Tensor:
-            return torch.exp(-(c.object_error / reach).square())
+            error = c.object_error
+            if cfg.beyond_plan and plan_error_m is not None:
+                error = (error - plan_error_m.to(c.t.device)[c.t - 1]).clamp(min=0.0)
+            return torch.exp(-(error / reach).square())
 
         recipe = replace(recipe, discount=discount)
     return recipe

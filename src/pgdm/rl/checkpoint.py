@@ -141,8 +141,8 @@ def write_checkpoint(path: Path, state: State) -> None:
     except OSError as error:
         raise CheckpointError(
             f"cannot write a checkpoint of {len(payload) / 1e6:.1f} MB to {path.parent} "
-            f"({free_bytes(path.parent) / 1e6:.1f} MB free): {error.strerror or error}; make room or "
-            "give write access, earlier checkpoints are untouched"
+            f"({free_bytes(path.parent) / 1e6:.1f} MB free): {error.strerror or error}; make "
+            "room or give write access, earlier checkpoints are untouched"
         ) from error
 
 
