@@ -128,6 +128,8 @@ def test_another_hand_than_the_tasks_own() -> None:
     ("override", "message"),
     [
         ("task=hammer-use9", "unknown task 'hammer-use9'; did you mean hammer-use1"),
+        ("task=300000", "unknown task '300000'; valid: "),
+        ("algo=null", "unknown algo 'null'; valid: ppo, "),
         ("hand=adriot", "unknown hand 'adriot'; did you mean adroit"),
         ("pregrasp=learnd", "unknown pregrasp 'learnd'; did you mean learned"),
         ("+experiment=quickstrat", "unknown experiment 'quickstrat'; did you mean quickstart"),
@@ -140,7 +142,7 @@ def test_another_hand_than_the_tasks_own() -> None:
         ("+seed=3", r"'seed' exists already; leave out the \+"),
         ("seed=1,2", r"'seed=1,2' has several values; add -m .* seed=\[a,b\]"),
         ("task=[duck-lift,cup-pour1]", "task takes one option, .* -m task=duck-lift,cup-pour1"),
-        ("task=null", "cannot apply task=null"),
+        ("task=null", "unknown task 'null'; valid: "),
         ("seed", "cannot read 'seed'; write key=value"),
         ("=3", "cannot read '=3'; write key=value"),
         ("+=3", r"cannot read '\+=3'; write key=value"),

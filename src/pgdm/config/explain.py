@@ -61,6 +61,10 @@ def explain(
         return ConfigError(f"a settings file is not valid YAML: {text}")
     if isinstance(error, HydraException | OmegaConfBaseException):
         return _explain_text(text, overrides, config_dir, keys)
+    for override in overrides:  # Hydra refuses an option that is a number without naming it
+        group, _, option = override.lstrip("+").partition("=")
+        if group in groups(config_dir) and option not in (known := available(group, config_dir)):
+            return _unknown_option(group, option, known, config_dir)
     return ConfigError(f"cannot apply {' '.join(overrides)}: {text}")
 
 
@@ -96,11 +100,17 @@ def _explain_missing(
     error: MissingConfigException, text: str, config_dir: str | None
 ) -> ConfigError:
     group, _, option = (error.missing_cfg_file or "").rpartition("/")
-    if group == "task" and error.options:
-        return unknown_task(option, config_dir)
     if group and error.options:
-        return UnknownNameError(group, option, [o for o in error.options if o[0] != "_"])
+        return _unknown_option(group, option, error.options, config_dir)
     return ConfigError(text)
+
+
+def _unknown_option(
+    group: str, option: str, options: Sequence[str], config_dir: str | None
+) -> ConfigError:
+    if group == "task":
+        return unknown_task(option, config_dir)
+    return UnknownNameError(group, option, [o for o in options if o[0] != "_"])
 
 
 def _known_names(overrides: Sequence[str], config_dir: str | None, keys: Keys) -> list[str]:
