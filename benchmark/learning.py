@@ -7,8 +7,8 @@
     python benchmark/learning.py --collect          collect only, also from running runs
 
 The runs of `+experiment=fast` itself are those that tcdm50.py has stored. The other settings,
-each the same for all tasks: `fast-limit-1` limits the policy's mean before tanh more,
-and `fast-unlimited` not at all;
+each the same for all tasks and all with `shaping.beyond_plan=false`: `fast-limit-1` limits the
+policy's mean before tanh more, and `fast-unlimited` not at all;
 `fast-earlier` has the released observation, linear corrections, uncorrelated noise, and neither
 an average nor a reward for the grasp; `fast-clipped` and `fast-feasible` are the same with another
 wrist path; `ppo_fast-planned` is `+experiment=fast` with another learner, `algo=ppo_fast`;
@@ -42,8 +42,10 @@ EARLY = 300_000
 
 HALF = 0.5
 QUICK6 = suite("quick6")
+WHOLE_ERROR = "shaping.beyond_plan=false"
 EARLIER = (
     "+experiment=fast",
+    WHOLE_ERROR,
     "eval.interval_frames=50000",
     "obs=released",
     "shaping=soft_end",
@@ -54,8 +56,8 @@ EARLIER = (
 )
 SETTINGS = {
     "fast": ("+experiment=fast",),
-    "fast-limit-1": ("+experiment=fast", "algo.pre_tanh_limit=1"),
-    "fast-unlimited": ("+experiment=fast", "algo.pre_tanh_limit=null"),
+    "fast-limit-1": ("+experiment=fast", WHOLE_ERROR, "algo.pre_tanh_limit=1"),
+    "fast-unlimited": ("+experiment=fast", WHOLE_ERROR, "algo.pre_tanh_limit=null"),
     "fast-earlier": EARLIER,
     "fast-clipped": (*EARLIER, "action.wrist_path=clipped"),
     "fast-feasible": (*EARLIER, "action.wrist_path=feasible"),
@@ -63,6 +65,7 @@ SETTINGS = {
         "algo=ppo_fast",
         "obs=relative",
         "shaping=grasp",
+        WHOLE_ERROR,
         "action=residual",
         "action.residual_power=2",
         "action.wrist_path=planned",

@@ -99,7 +99,7 @@ def test_old_scenes_are_marked_and_in_no_mean_and_missing_times_are_told() -> No
 
 def test_ppo_is_compared_with_everything_else_as_in_fast() -> None:
     fast, ppo = (
-        compose(["task=hammer-use1", *learning.SETTINGS[name]])
+        compose(["task=hammer-use1", *learning.SETTINGS[name], learning.WHOLE_ERROR])
         for name in ("fast", "ppo_fast-planned")
     )
     assert ppo.algo.name == "ppo_fast"

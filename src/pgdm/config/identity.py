@@ -67,7 +67,7 @@ ADDED_LATER: dict[str, Any] = {
 _ONLY_SAC = ("algo.average_rate", "algo.noise_correlation", "algo.pre_tanh_limit")
 
 # Keys that have an effect only if the wrist is planned.
-_ONLY_PLANNED = ("action.hold_steps", "action.carry_load")
+_ONLY_PLANNED = ("action.hold_steps", "action.carry_load", "shaping.beyond_plan")
 
 
 def with_added_keys(plain: Mapping[str, Any]) -> dict[str, Any]:
