@@ -113,7 +113,7 @@ def test_keys_of_a_planned_wrist_count_only_where_it_is_planned() -> None:
     def hashed(*overrides: str) -> str:
         return identity_hash(compose(["+experiment=fast", *overrides]))
 
-    plain = "action.hold_steps=0", "action.carry_load=false"
+    plain = "action.hold_steps=0", "action.carry_load=false", "shaping.beyond_plan=false"
     clipped = "action.wrist_path=clipped"
     assert hashed(clipped) == hashed(clipped, *plain)  # as it was before there were the keys
-    assert len({hashed(), *(hashed(key) for key in plain)}) == 3
+    assert len({hashed(), *(hashed(key) for key in plain)}) == 4
