@@ -95,6 +95,12 @@ def test_only_an_intact_pregrasp_is_to_be_kept(far: tuple[str, ...]) -> None:
     assert away.grasp_weight == 0 and away.soft_end_m == 0.15
 
 
+def test_without_a_wrist_plan_the_whole_error_counts() -> None:
+    assert compose(["+experiment=fast"]).used_shaping.beyond_plan
+    assert not compose(["+experiment=fast", "action.wrist_path=clipped"]).used_shaping.beyond_plan
+    assert not compose(["action=absolute", "shaping=soft_end"]).used_shaping.beyond_plan
+
+
 def test_the_additions_are_described_in_words() -> None:
     assert NO_SHAPING.described() == ""
     described = replace(NO_SHAPING, kernel_weight=5.0, soft_end_m=0.15).described()

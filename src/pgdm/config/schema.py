@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from pgdm.config.ranges import check_ranges
@@ -87,9 +87,14 @@ class ExperimentCfg:
 
     @property
     def used_shaping(self) -> ShapingCfg:
-        """The shaping, without its grasp term if episodes do not start at an intact pre-grasp."""
+        """The shaping, without what does not apply.
+
+        That is the grasp term if episodes do not start at an intact pre-grasp, and the error of the
+        wrist plan if there is none.
+        """
         intact = self.pregrasp.source != "none" and not self.ablation.changes_start
-        return self.shaping if intact else self.shaping.without_grasp()
+        shaping = self.shaping if intact else replace(self.shaping, grasp_weight=0.0)
+        return shaping if self.action.plans_wrist else replace(shaping, beyond_plan=False)
 
     def validate(self) -> None:
         """Check names, choices and ranges of single fields, and the rules that hold between fields.

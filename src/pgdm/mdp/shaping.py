@@ -53,10 +53,6 @@ class ShapingCfg:
     """Whether that discount counts only the error beyond that of the wrist plan, if there is a
     plan."""
 
-    def without_grasp(self) -> ShapingCfg:
-        """Return the shaping without the grasp term, for starts that are not a pre-grasp."""
-        return replace(self, grasp_weight=0.0)
-
     def described(self) -> str:
         """Return the shaping as a phrase, empty if it adds nothing."""
         parts = []
