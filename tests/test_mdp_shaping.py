@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -84,6 +85,21 @@ def test_the_soft_end_counts_only_what_exceeds_the_plan() -> None:
     torch.testing.assert_close(discount(True, plan_error), beyond)
     torch.testing.assert_close(discount(True, None), whole)
     torch.testing.assert_close(discount(False, plan_error), whole)
+
+
+@pytest.mark.usefixtures("library_home")
+def test_training_spares_the_error_of_its_own_wrist_plan() -> None:
+    cfg = compose(["+experiment=fast", "task=duck-lift", "shaping.soft_end_m=0.01"])
+    idle = np.zeros((20, 6))  # a base that stays behind: the plan's error grows
+    builder = env_builder(cfg, open_library(), commands=idle)
+    env = builder.make(2, 1)
+    context = env._context(env.sim.read())
+    context = replace(context, t=torch.tensor([1, 20]))
+    assert builder.wrist is not None and env.mdp.recipe.discount is not None
+    beyond = (context.object_error.numpy() - builder.wrist.error_m[[0, 19]]).clip(min=0.0)
+    assert beyond[1] == 0.0 < context.object_error[1]
+    expected = torch.exp(-(torch.from_numpy(beyond) / 0.01).square())
+    torch.testing.assert_close(env.mdp.recipe.discount(context), expected)
 
 
 @pytest.mark.parametrize(
