@@ -117,7 +117,7 @@ def markdown() -> str:
     )
     return (
         "The step of every metric is in frames: control steps, summed over all simulations. "
-        "`train/` covers the episodes that ended in an iteration; `eval_sampled/` draws actions "
+        "`train/` covers the episodes that\nended in an iteration; `eval_sampled/` draws actions "
         "(as the paper does), `eval_deterministic/` takes the mean action.\n\n"
         f"| metric | unit | meaning | groups |\n|---|---|---|---|\n{rows}\n"
     )
