@@ -16,7 +16,8 @@ from pgdm.config.identity import with_added_keys
 BENCHMARK = Path(__file__).resolve().parents[1] / "benchmark"
 
 sys.path.insert(0, str(BENCHMARK))
-import methods  # noqa: E402 (benchmark/ is no package: each file is a program)
+import fast_methods  # noqa: E402 (benchmark/ is no package: each file is a program)
+import methods  # noqa: E402
 import study  # noqa: E402
 import tcdm50  # noqa: E402
 import wrist  # noqa: E402
@@ -59,3 +60,13 @@ def test_the_table_of_all_tasks_is_current() -> None:
 def test_the_page_on_learning_shows_the_stored_curves() -> None:
     shown = BENCHMARK.parent / "docs" / "images" / "learning.png"
     assert shown.read_bytes() == (BENCHMARK / "results" / "learning" / "curves.png").read_bytes()
+
+
+def test_the_baselines_are_compared_at_pgdms_frames_and_in_points() -> None:
+    rows = {"a": {"pgdm": (0.5, 1.0), "graff": (0.7, 1.0)}, "b": {"pgdm": (0.2, 0.9)}}
+    rows["c"] = {"pgdm": (0.4, 1.0), "graff": (0.3, 0.8)}
+    assert fast_methods.differences(rows, "graff") == pytest.approx([0.2, -0.1])
+    # t at 97.5% and 1 degree of freedom is 12.706; the standard error is 0.15.
+    assert "| +5.0 (-185.6 to +195.6) |" in fast_methods.table(rows)
+    for task in fast_methods.TASKS:
+        assert fast_methods.wanted(fast_methods.settings("graff", task))
