@@ -14,13 +14,14 @@ the run as the paper's 4M frames are of its 50M.
 from __future__ import annotations
 
 import argparse
-from math import isnan, nan
+from math import nan
 from pathlib import Path
 from typing import Any
 
 import tcdm50
 from scipy.stats import ttest_1samp
 from short_runs import report, store
+from study import ramp
 
 from pgdm.config.compose import compose
 from pgdm.config.identity import identity_hash
@@ -35,11 +36,10 @@ RESULTS = Path(__file__).parent / "results" / "fast_methods"
 PICTURE = Path(__file__).parent.parent / "docs" / "images" / "fast_methods.png"
 TASKS = suite("tcdm30")[::3]
 FRAMES = 100_000
-RAMP = f"method.curriculum.ramp_frames={4_000_000 * FRAMES // 50_000_000}"
 BASELINES: dict[str, tuple[str, ...]] = {
     "deepmimic": ("method=deepmimic",),
     "graff": ("method=graff",),
-    "curriculum": ("method=curriculum", RAMP),
+    "curriculum": ("method=curriculum", ramp(FRAMES)),
 }
 SUCCESS, LIFTED = tcdm50.SUCCESS, tcdm50.LIFTED
 
@@ -73,7 +73,7 @@ def of_pgdm(task: str) -> tuple[float, float] | None:
         return None
     for line in RunLog(folder / LOG).read():
         if line["kind"] == "eval" and int(line["frames"]) >= FRAMES:
-            return float(line[SUCCESS]), float(line.get(LIFTED, nan))
+            return float(line[SUCCESS]), float(line[LIFTED])
     return None
 
 
@@ -86,7 +86,7 @@ def measured() -> Rows:
         for method in BASELINES:
             if (file := place(method, task) / RESULT).is_file():
                 metrics: dict[str, Any] = read_json(file)["metrics"]
-                methods[method] = metrics[SUCCESS], metrics.get(LIFTED, nan)
+                methods[method] = metrics[SUCCESS], metrics[LIFTED]
     return found
 
 
@@ -126,7 +126,7 @@ def draw(rows: Rows, file: Path) -> None:
     for number, method in enumerate(names):
         values = [row.get(method, (nan, nan))[0] for row in rows.values()]
         at = [task + 0.2 * (number - 1.5) for task in range(len(rows))]
-        axes.bar(at, [0 if isnan(v) else v for v in values], 0.19, label=method)
+        axes.bar(at, values, 0.19, label=method)
     axes.set_xticks(range(len(rows)), list(rows), rotation=25, ha="right", fontsize=8)
     axes.set(ylim=(0, 1), ylabel="success, sampled actions")
     axes.yaxis.set_major_formatter("{x:.0%}")

@@ -29,8 +29,12 @@ from pgdm.runs.folder import find_runs
 RESULTS = Path(__file__).parent / "results" / "study"
 PICTURE = Path(__file__).parent.parent / "docs" / "images" / "study.png"
 FRAMES = 500_000
-# As large a share of these frames as the paper's ramp of 4M is of its 50M.
-RAMP = f"method.curriculum.ramp_frames={4_000_000 * FRAMES // 50_000_000}"
+
+
+def ramp(frames: int) -> str:
+    """Return the curriculum's ramp, as large a share of a run as the paper's 4M are of its 50M."""
+    return f"method.curriculum.ramp_frames={4_000_000 * frames // 50_000_000}"
+
 
 TASKS = suite("quick6")
 EXPERTS = [task for task in TASKS if task in suite("adroit_experts")]
@@ -53,7 +57,7 @@ _CHANGES = {
     "distance_25cm": (TASKS, ("ablation=distance_25cm",)),
     "deepmimic": (EXPERTS, ("method=deepmimic",)),
     "graff": (EXPERTS, ("method=graff",)),
-    "curriculum": (TASKS, ("method=curriculum", RAMP)),
+    "curriculum": (TASKS, ("method=curriculum", ramp(FRAMES))),
 }
 # Also with the paper's actions, since residual ones cannot move the hand back to its pre-grasp.
 _ALSO_ABSOLUTE = ("pgdm", "no_pregrasp", "open_hand", "distance_15cm")

@@ -70,3 +70,6 @@ def test_the_baselines_are_compared_at_pgdms_frames_and_in_points() -> None:
     assert "| +5.0 (-185.6 to +195.6) |" in fast_methods.table(rows)
     for task in fast_methods.TASKS:
         assert fast_methods.wanted(fast_methods.settings("graff", task))
+    for other in ("method=pgdm", "method=graff seed=1", "method=graff total_frames=50000"):
+        words = ["+experiment=fast", "task=cup-pour1", "total_frames=100000", *other.split()]
+        assert not fast_methods.wanted(compose(words))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import NamedTuple
 
 
@@ -115,9 +116,12 @@ def markdown() -> str:
     rows = "\n".join(
         f"| `{m.name}` | {m.unit} | {m.meaning} | {groups[m.groups]} |" for m in METRICS
     )
-    return (
+    about = (
         "The step of every metric is in frames: control steps, summed over all simulations. "
-        "`train/` covers the episodes that\nended in an iteration; `eval_sampled/` draws actions "
-        "(as the paper does), `eval_deterministic/` takes the mean action.\n\n"
+        "`train/` covers the episodes that ended in an iteration; `eval_sampled/` draws actions "
+        "(as the paper does), `eval_deterministic/` takes the mean action."
+    )
+    return (
+        f"{textwrap.fill(about, 120)}\n\n"
         f"| metric | unit | meaning | groups |\n|---|---|---|---|\n{rows}\n"
     )
